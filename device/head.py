@@ -463,9 +463,17 @@ def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None
     chips, button = opening.chips(), opening.button()
     return Head(
-        spec, camera, light, calibration, chips, button,
-        provenance=known, present_eye=facing, place_trial_lens=lens_placer, place_white_card=card_placer,
-    )  # fmt: skip
+        spec,
+        camera,
+        light,
+        calibration,
+        chips,
+        button,
+        provenance=known,
+        present_eye=facing,
+        place_trial_lens=lens_placer,
+        place_white_card=card_placer,
+    )
 
 
 def refuse_mismatched_head(head: Head) -> None:

@@ -39,9 +39,12 @@ from services.records.store_command import app as store
 from services.update.command import app as update_app
 
 app = typer.Typer(
-    name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
-    add_completion=False, pretty_exceptions_enable=False,
-)  # fmt: skip
+    name="diffuscope",
+    help="A funduscope whose lens is a piece of diffuser.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
 app.add_typer(calibration_archive.app, name="calibrations")
 
 app.add_typer(update_app, name="update")
@@ -102,9 +105,17 @@ def run(
     address = inherited_socket(os.environ) or bind_socket(host, port)
     served, at = address.getsockname()[:2]
     serve(
-        spec, address, data or _default_data(), lambda: typer.echo(f"Open {base_url(served, at)} in a browser"),
-        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, measure_scene, tuple(name or ()), (updates, wishes), uploader,
-    )  # fmt: skip
+        spec,
+        address,
+        data or _default_data(),
+        lambda: typer.echo(f"Open {base_url(served, at)} in a browser"),
+        Watchdog(os.environ.get("NOTIFY_SOCKET")),
+        plan,
+        measure_scene,
+        tuple(name or ()),
+        (updates, wishes),
+        uploader,
+    )
 
 
 def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs: tuple[Path, ...]) -> InstrumentSpec:
@@ -117,7 +128,7 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
 
 
 @app.command(cls=ReconstructCommand)
-def reconstruct(  # size: each option of the command is one declared parameter
+def reconstruct(
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
     raw: Annotated[
         list[Path] | None, typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; several are one burst.")
@@ -180,10 +191,27 @@ def reconstruct(  # size: each option of the command is one declared parameter
     channels, raws = parse_channels(channel or [], calibration is not None), raw or []
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
-        raws[0] if raws else Path(), psf_stack(psf or ()), None if each else output, method, budget_s, common_dark,
-        flat, head and head_file(head), field_deg, even, resources.fft_plans(), None if each else report, sweep,
-        calibration, bin, rounds, parse_settings(setting or ()), parse_bayer(bayer), field_fixed, not no_refraction,
-    )  # fmt: skip
+        raws[0] if raws else Path(),
+        psf_stack(psf or ()),
+        None if each else output,
+        method,
+        budget_s,
+        common_dark,
+        flat,
+        head and head_file(head),
+        field_deg,
+        even,
+        resources.fft_plans(),
+        None if each else report,
+        sweep,
+        calibration,
+        bin,
+        rounds,
+        parse_settings(setting or ()),
+        parse_bayer(bayer),
+        field_fixed,
+        not no_refraction,
+    )
     refuse_mixed(raws, channels, darks, each)
     with working("reconstructing", _progress, SystemClock()) as beat:
         if each:
@@ -570,9 +598,19 @@ def frontier(
     from services.lab import frontier_pairs
 
     request = measured.FrontierRequest(
-        scene and scene_file(scene), raw, psf, truth, head and head_file(head), field_deg, json_file, plot, budget_s,
-        repeats, resources.fft_plans(), tuple(method or ()),
-    )  # fmt: skip
+        scene and scene_file(scene),
+        raw,
+        psf,
+        truth,
+        head and head_file(head),
+        field_deg,
+        json_file,
+        plot,
+        budget_s,
+        repeats,
+        resources.fft_plans(),
+        tuple(method or ()),
+    )
     wanted = None if data is None else frontier_pairs.dataset_request(request, data, limit)
     with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:
         if wanted is None:

@@ -32,10 +32,28 @@ if TYPE_CHECKING:
     from services.lab.reconstruct_file import FileReconstruction, FileReport
 
 __all__ = [
-    "Dataset", "DiffuscopeError", "FileReconstruction", "FileReport", "ForwardModel", "FrameError", "Frontier",
-    "Method", "Pair", "PsfError", "ReconstructionOptions", "Reconstructor", "SettingError", "SimulatedScene",
-    "SpecError", "__version__", "frontier", "methods", "open_dataset", "reconstruct", "simulate",
-]  # fmt: skip
+    "Dataset",
+    "DiffuscopeError",
+    "FileReconstruction",
+    "FileReport",
+    "ForwardModel",
+    "FrameError",
+    "Frontier",
+    "Method",
+    "Pair",
+    "PsfError",
+    "ReconstructionOptions",
+    "Reconstructor",
+    "SettingError",
+    "SimulatedScene",
+    "SpecError",
+    "__version__",
+    "frontier",
+    "methods",
+    "open_dataset",
+    "reconstruct",
+    "simulate",
+]
 __version__ = version("diffuscope")
 
 _MODULES = {
@@ -45,11 +63,17 @@ _MODULES = {
     "services.lab.datasets": ("open_dataset",),
     "services.lab.frontier_result": ("Frontier",),
     "services.lab.python_api": (
-        "ForwardModel", "ReconstructionOptions", "Reconstructor", "SimulatedScene", "frontier", "methods",
-        "reconstruct", "simulate",
+        "ForwardModel",
+        "ReconstructionOptions",
+        "Reconstructor",
+        "SimulatedScene",
+        "frontier",
+        "methods",
+        "reconstruct",
+        "simulate",
     ),
     "services.lab.reconstruct_file": ("FileReconstruction", "FileReport"),
-}  # fmt: skip
+}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 

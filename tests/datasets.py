@@ -139,7 +139,13 @@ def write_pairs(folder: Path, scene: Scene) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Scene], None]] = {
-    "dlmd": write_dlmd, "full dlmd": write_full_dlmd, "lenslesspicam": write_export,
-    "lenslesspicam-raw": write_raw_data, "diffusercam-3d": write_depths, "matlab": write_matlab_depths,
-    "diffusercam-tutorial": write_tutorial, "simulated": write_simulated, "pairs": write_pairs,
-}  # fmt: skip
+    "dlmd": write_dlmd,
+    "full dlmd": write_full_dlmd,
+    "lenslesspicam": write_export,
+    "lenslesspicam-raw": write_raw_data,
+    "diffusercam-3d": write_depths,
+    "matlab": write_matlab_depths,
+    "diffusercam-tutorial": write_tutorial,
+    "simulated": write_simulated,
+    "pairs": write_pairs,
+}

@@ -5,11 +5,28 @@ They are copied from /boot/config-6.12.118+deb13-ARCH of linux-image-ARCH; "y" i
 """
 
 _BOTH = {
-    "BLK_DEV_LOOP": "m", "CFG80211": "m", "DM_CRYPT": "m", "DM_VERITY": "m", "EXFAT_FS": "m", "EXT4_FS": "m",
-    "GPIO_CDEV": "y", "I2C_CHARDEV": "m", "MEDIA_CONTROLLER": "y", "MMC_SDHCI": "m", "NLS_ASCII": "m",
-    "NLS_CODEPAGE_437": "m", "OVERLAY_FS": "m", "SPI_SPIDEV": "y", "SQUASHFS": "m", "SQUASHFS_ZSTD": "y",
-    "USB_STORAGE": "m", "VFAT_FS": "m", "VIDEO_DEV": "m", "VIDEO_VIVID": "m", "VIRTIO_BLK": "m",
-}  # fmt: skip
+    "BLK_DEV_LOOP": "m",
+    "CFG80211": "m",
+    "DM_CRYPT": "m",
+    "DM_VERITY": "m",
+    "EXFAT_FS": "m",
+    "EXT4_FS": "m",
+    "GPIO_CDEV": "y",
+    "I2C_CHARDEV": "m",
+    "MEDIA_CONTROLLER": "y",
+    "MMC_SDHCI": "m",
+    "NLS_ASCII": "m",
+    "NLS_CODEPAGE_437": "m",
+    "OVERLAY_FS": "m",
+    "SPI_SPIDEV": "y",
+    "SQUASHFS": "m",
+    "SQUASHFS_ZSTD": "y",
+    "USB_STORAGE": "m",
+    "VFAT_FS": "m",
+    "VIDEO_DEV": "m",
+    "VIDEO_VIVID": "m",
+    "VIRTIO_BLK": "m",
+}
 CONFIG = {
     "amd64": {
         **_BOTH,
@@ -31,16 +48,27 @@ CONFIG = {
 
 # Option that mounts a file system type, and that makes a udev subsystem or the character devices of DeviceAllow=.
 FILE_SYSTEMS = {
-    "exfat": "EXFAT_FS", "ext4": "EXT4_FS", "overlay": "OVERLAY_FS", "squashfs": "SQUASHFS", "vfat": "VFAT_FS",
-}  # fmt: skip
+    "exfat": "EXFAT_FS",
+    "ext4": "EXT4_FS",
+    "overlay": "OVERLAY_FS",
+    "squashfs": "SQUASHFS",
+    "vfat": "VFAT_FS",
+}
 SUBSYSTEMS = {
-    "dma_heap": "DMABUF_HEAPS_SYSTEM", "gpio": "GPIO_CDEV", "i2c-dev": "I2C_CHARDEV", "ieee80211": "CFG80211",
+    "dma_heap": "DMABUF_HEAPS_SYSTEM",
+    "gpio": "GPIO_CDEV",
+    "i2c-dev": "I2C_CHARDEV",
+    "ieee80211": "CFG80211",
     "spidev": "SPI_SPIDEV",
-}  # fmt: skip
+}
 DEVICES = {
-    "dma_heap": "DMABUF_HEAPS_SYSTEM", "gpiochip": "GPIO_CDEV", "i2c": "I2C_CHARDEV", "media": "MEDIA_CONTROLLER",
-    "spi": "SPI_SPIDEV", "video4linux": "VIDEO_DEV",
-}  # fmt: skip
+    "dma_heap": "DMABUF_HEAPS_SYSTEM",
+    "gpiochip": "GPIO_CDEV",
+    "i2c": "I2C_CHARDEV",
+    "media": "MEDIA_CONTROLLER",
+    "spi": "SPI_SPIDEV",
+    "video4linux": "VIDEO_DEV",
+}
 MODULES = {"i2c-dev": "I2C_CHARDEV", "spidev": "SPI_SPIDEV", "videodev": "VIDEO_DEV"}
 
 # Debian's kernel of that processor lacks them, and the card runs without: only libcamera opens dma_heap.

@@ -11,9 +11,20 @@ ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 TOP_FOLDERS = ("device", "services", "web", "systemd", "tests", "hardware")
 TOP_FILES = {
-    ".ci", ".github", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
-    "LICENSE", "LICENSES", "Makefile", "README.md", "REUSE.toml", "pyproject.toml", "requirements.lock",
-}  # fmt: skip
+    ".ci",
+    ".github",
+    ".gitignore",
+    "CHANGELOG.md",
+    "CITATION.cff",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "LICENSES",
+    "Makefile",
+    "README.md",
+    "REUSE.toml",
+    "pyproject.toml",
+    "requirements.lock",
+}
 
 Violation = tuple[int, str, str]
 Finder = Callable[[str], Iterable[Violation]]

@@ -60,14 +60,18 @@ def coarse(spec: InstrumentSpec, k: int) -> InstrumentSpec:
     camera, sim = spec.camera, spec.sim
     assert sim is not None
     summed = {
-        "rows": camera.rows // k, "cols": camera.cols // k, "pitch_um": k * camera.pitch_um,
-        "full_well_e": k**2 * camera.full_well_e, "read_noise_e": k * camera.read_noise_e,
+        "rows": camera.rows // k,
+        "cols": camera.cols // k,
+        "pitch_um": k * camera.pitch_um,
+        "full_well_e": k**2 * camera.full_well_e,
+        "read_noise_e": k * camera.read_noise_e,
         "bit_depth": min(camera.bit_depth + 2, 16),
-    }  # fmt: skip
+    }
     flaws = {
-        "dsnu_e": k * sim.sensor.dsnu_e, "dark_e_per_s": k**2 * sim.sensor.dark_e_per_s,
+        "dsnu_e": k * sim.sensor.dsnu_e,
+        "dark_e_per_s": k**2 * sim.sensor.dark_e_per_s,
         "line_s": k * sim.sensor.line_s,
-    }  # fmt: skip
+    }
     head = spec.model_copy(update={"camera": camera.model_copy(update=summed)})
     peak_e = sim.peak_e if sim.peak_e == "budget" else k**2 * sim.peak_e  # a budget follows the pixels by itself
     return with_keys(head, peak_e=peak_e, sensor=flaws)
@@ -99,7 +103,5 @@ def expected_electrons(of: World) -> NDArray[np.float64]:
     with SimLight(of).on(Illumination(of.spec.light.colour)):
         arriving = of.electrons(of.spec.camera.exposure_s)
     gain = of.scene.peak_e / 40000
-    reader = replace(
-        of.sensor, shot=False, read_noise_e=0.0, gain_e_per_dn=gain, black_dn=PEDESTAL_DN, white_dn=65535
-    )  # fmt: skip
+    reader = replace(of.sensor, shot=False, read_noise_e=0.0, gain_e_per_dn=gain, black_dn=PEDESTAL_DN, white_dn=65535)
     return gain * (reader.read(arriving, 0).astype(np.float64) - PEDESTAL_DN)

@@ -247,9 +247,13 @@ def lose_table(folder: Path, _: list[Path], source: random.Random) -> str:
 
 
 DAMAGES: dict[str, Damage] = {
-    "bit": flip_bit, "truncated": truncate, "zeros": zero_block, "removed": remove, "swapped": swap,
+    "bit": flip_bit,
+    "truncated": truncate,
+    "zeros": zero_block,
+    "removed": remove,
+    "swapped": swap,
     "table": lose_table,
-}  # fmt: skip
+}
 
 
 def targets(folder: Path, which: str) -> list[Path]:
@@ -281,14 +285,30 @@ class Planned:
 
 
 SHARES = {  # of the trials, in thousandths
-    ("bit", "database"): 450, ("bit", "log"): 150, ("bit", "files"): 150, ("bit", "ledger"): 65,
-    ("truncated", "database"): 20, ("truncated", "log"): 20, ("truncated", "files"): 25, ("truncated", "ledger"): 10,
-    ("zeros", "database"): 20, ("zeros", "log"): 15, ("zeros", "files"): 15, ("zeros", "ledger"): 5,
-    ("removed", "files"): 20, ("removed", "database"): 2, ("removed", "log"): 1, ("removed", "ledger"): 2,
-    ("swapped", "files"): 20, ("table", "database"): 10,
-    ("bit", "settings"): 90, ("truncated", "settings"): 15, ("zeros", "settings"): 10, ("removed", "settings"): 10,
+    ("bit", "database"): 450,
+    ("bit", "log"): 150,
+    ("bit", "files"): 150,
+    ("bit", "ledger"): 65,
+    ("truncated", "database"): 20,
+    ("truncated", "log"): 20,
+    ("truncated", "files"): 25,
+    ("truncated", "ledger"): 10,
+    ("zeros", "database"): 20,
+    ("zeros", "log"): 15,
+    ("zeros", "files"): 15,
+    ("zeros", "ledger"): 5,
+    ("removed", "files"): 20,
+    ("removed", "database"): 2,
+    ("removed", "log"): 1,
+    ("removed", "ledger"): 2,
+    ("swapped", "files"): 20,
+    ("table", "database"): 10,
+    ("bit", "settings"): 90,
+    ("truncated", "settings"): 15,
+    ("zeros", "settings"): 10,
+    ("removed", "settings"): 10,
     ("swapped", "settings"): 10,
-}  # fmt: skip
+}
 
 
 def plan(number: int) -> list[Planned]:

@@ -13,17 +13,26 @@ from services.records.capture_store import CaptureStore
 
 
 def write_store(
-    folder: Path, raw: NDArray[np.uint16], calibration_id: str, names: tuple[str, ...],
+    folder: Path,
+    raw: NDArray[np.uint16],
+    calibration_id: str,
+    names: tuple[str, ...],
     device: RecordOrigin | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Add captures to a store, each with a little more light than the one before, and with a dark frame."""
     with CaptureStore(folder, reserve_bytes=0) as store:
         for k, name in enumerate(names):
             taken_at = VirtualClock().wall()
             capture = Capture(name, "OD", taken_at, True, calibration_id, CaptureReport(device=device), {})
             metadata = RawMetadata(
-                id=name, eye="OD", taken_at=taken_at, exposure_s=0.1, illumination=None, simulated=True,
-                calibration_id=calibration_id, head="tiny",
-            )  # fmt: skip
+                id=name,
+                eye="OD",
+                taken_at=taken_at,
+                exposure_s=0.1,
+                illumination=None,
+                simulated=True,
+                calibration_id=calibration_id,
+                head="tiny",
+            )
             lit, dark = raw_tiff(raw + np.uint16(k), metadata), raw_tiff(raw // 100, metadata)
             store.save(capture, {"raw.tiff": lit, "dark.tiff": dark, "report.json": b"{}", "picture.png": b""})

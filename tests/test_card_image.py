@@ -22,9 +22,14 @@ CARD = "systemd/image/card"
 LAYERS = {"layer/diffuscope.yaml": "diffuscope", "image/diffuscope-card.yaml": "diffuscope-card"}
 # Layers of rpi-image-gen that are used here, as listed in its documentation in August 2026.
 THEIRS = {
-    "rpi5", "image-base", "debian-trixie-arm64-multi", "rpi-debian-trixie", "rpi-essential-base", "systemd-min",
+    "rpi5",
+    "image-base",
+    "debian-trixie-arm64-multi",
+    "rpi-debian-trixie",
+    "rpi-essential-base",
+    "systemd-min",
     "network-manager",
-}  # fmt: skip
+}
 # Package of a program that is called on the card, and the file that calls it.
 PROGRAMS = {
     "qrencode": ("qrencode", "services/identity/apply_at_boot.py"),
@@ -223,7 +228,11 @@ def test_every_file_beside_the_recipe_is_installed() -> None:
     }
     assert beside - tools <= brought
     assert set(re.findall(r"systemctl.*enable (.*)", recipe)[0].split()) == {
-        "diffuscope.service", "diffuscope-identity.service", "diffuscope-settle.service", "diffuscope-update.timer",
-        "diffuscope-wish.path", "diffuscope-clock.path",
-    }  # fmt: skip
+        "diffuscope.service",
+        "diffuscope-identity.service",
+        "diffuscope-settle.service",
+        "diffuscope-update.timer",
+        "diffuscope-wish.path",
+        "diffuscope-clock.path",
+    }
     assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

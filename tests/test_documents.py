@@ -17,9 +17,10 @@ from tests.scenes import speckle
 
 SITE = "services/lab/site/"
 DOCUMENTS = [
-    name for name in files()
+    name
+    for name in files()
     if name.endswith(".md") and not re.search(r"/decisions/|^tests/golden/(kept|records)|^CHANGELOG", name)
-]  # fmt: skip
+]
 PAGES = [name for name in DOCUMENTS if Path(name).name == "README.md" or name.startswith(SITE)]
 FENCE = re.compile(r"^ *```.*?^ *```$", re.M | re.S)
 
@@ -121,8 +122,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     psf, truth = speckle((96, 128)), np.zeros((96, 128), np.float32)
     truth[24:72, 32:96] = 20_000 + 10_000 * np.kron(rng.random((12, 16)), np.ones((4, 4)))
     light = signal.fftconvolve(truth, psf, mode="same").clip(0)
-    for name, image in (("raw", light + 64 + rng.normal(0, 4, light.shape)), ("psf", psf / psf.max() * 60_000 + 64),
-                        ("dark", np.full_like(light, 64))):  # fmt: skip
+    for name, image in (
+        ("raw", light + 64 + rng.normal(0, 4, light.shape)),
+        ("psf", psf / psf.max() * 60_000 + 64),
+        ("dark", np.full_like(light, 64)),
+    ):
         tifffile.imwrite(folder / f"{name}.tiff", image.round().astype(np.uint16))
     np.save(folder / "truth.npy", truth)
     return folder
@@ -141,10 +145,13 @@ def test_python_snippets_of_a_document_run(document: str, recording: Path, tmp_p
 # Decisions
 
 SECTIONS = [
-    re.compile(r"^# \d+\.? .*\n\n(?:Date: )?20\d\d-\d\d-\d\d.*\n\n"
-               rf"{begin}Context{end}(?:.*\n)+?{begin}Decision{end}(?:.*\n)+?{begin}Consequences{end}", re.M)
+    re.compile(
+        r"^# \d+\.? .*\n\n(?:Date: )?20\d\d-\d\d-\d\d.*\n\n"
+        rf"{begin}Context{end}(?:.*\n)+?{begin}Decision{end}(?:.*\n)+?{begin}Consequences{end}",
+        re.M,
+    )
     for begin, end in ((r"## ", r"\n"), (r"\*\*", r"\.\*\*\s"))
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("decision", [name for name in files() if "/decisions/" in name])

@@ -136,8 +136,10 @@ def test_the_wheel_holds_what_the_instrument_needs_at_run_time(wheel: Path) -> N
 def test_the_wheel_installs_no_common_name_into_site_packages(wheel: Path) -> None:
     """Names such as `web`, `hardware` or CHANGELOG.md could collide with other packages."""
     assert {path.name for path in wheel.iterdir() if not path.name.endswith(".dist-info")} == {
-        "device", "services", "diffuscope",
-    }  # fmt: skip
+        "device",
+        "services",
+        "diffuscope",
+    }
 
 
 @pytest.mark.parametrize("installed", ["wheel", "editable"])
@@ -188,8 +190,11 @@ def code_in(markdown: str) -> list[str]:
 def commands() -> dict[str, set[str]]:
     """Return the commands of `diffuscope`, subcommands included, each with its options."""
     group = typer.main.get_group(app)
-    inner = [(f"{name} {second}", command) for name, outer in group.commands.items()
-             for second, command in getattr(outer, "commands", {}).items()]  # fmt: skip
+    inner = [
+        (f"{name} {second}", command)
+        for name, outer in group.commands.items()
+        for second, command in getattr(outer, "commands", {}).items()
+    ]
     return {
         name: {"--help"}.union(*(p.opts + p.secondary_opts for p in command.params))
         for name, command in [*group.commands.items(), *inner]
@@ -331,16 +336,24 @@ def wrong_citations(source: str, citing: str) -> list[str]:
 def test_a_wrong_citation_is_found() -> None:
     here = "device/optics/eye.py"
     right = (
-        "OPTICS.md 1.1 to 1.4, the paper", "NUMERICS.md 3.5, items 5, 6 and 12 (shift)", "# OPTICS.md\n    # 2.6: T",
-        "[NUMERICS.md](../recon/NUMERICS.md) 7.1", "`OPTICS.md`", "hardware/assembly.md", "OPTICS.md 1.2, 30 degrees",
-    )  # fmt: skip
+        "OPTICS.md 1.1 to 1.4, the paper",
+        "NUMERICS.md 3.5, items 5, 6 and 12 (shift)",
+        "# OPTICS.md\n    # 2.6: T",
+        "[NUMERICS.md](../recon/NUMERICS.md) 7.1",
+        "`OPTICS.md`",
+        "hardware/assembly.md",
+        "OPTICS.md 1.2, 30 degrees",
+    )
     assert [wrong_citations(one, here) for one in right] == [[]] * len(right)
     wrong = {
-        "optics.md": ["optics.md"], "(OPTICS.md 1.1, 99.1 and 1.4)": ["OPTICS.md 99.1"],
-        "NUMERICS.md 3.5, item 99": ["NUMERICS.md 3.5, item 99"], "# NUMERICS.md\n# 99.9": ["NUMERICS.md 99.9"],
+        "optics.md": ["optics.md"],
+        "(OPTICS.md 1.1, 99.1 and 1.4)": ["OPTICS.md 99.1"],
+        "NUMERICS.md 3.5, item 99": ["NUMERICS.md 3.5, item 99"],
+        "# NUMERICS.md\n# 99.9": ["NUMERICS.md 99.9"],
         "../optics/NUMERICS.md 3.5": ["../optics/NUMERICS.md 3.5", "../optics/NUMERICS.md"],
-        "](../OPTICS.md) 1.1": ["../OPTICS.md 1.1", "../OPTICS.md"], "notes/optics.md": ["notes/optics.md"],
-    }  # fmt: skip
+        "](../OPTICS.md) 1.1": ["../OPTICS.md 1.1", "../OPTICS.md"],
+        "notes/optics.md": ["notes/optics.md"],
+    }
     assert {one: wrong_citations(one, here) for one in wrong} == wrong
 
 
@@ -392,10 +405,11 @@ def missing_paths(name: str) -> list[str]:
 @pytest.mark.parametrize(
     "name",
     [
-        name for name in files()
+        name
+        for name in files()
         if Path(name).suffix not in BINARY and not name.startswith("tests/golden/") and name != "CHANGELOG.md"
     ],
-)  # fmt: skip
+)
 def test_paths_and_modules_in_a_file_exist(name: str) -> None:
     """Units, udev rules, image scripts, Makefile, docstrings and documents name files that are in the repository."""
     assert not missing_paths(name)

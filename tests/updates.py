@@ -66,11 +66,17 @@ class Board:
     def settings(self, **changed: object) -> UpdateSettings:
         here = self.folder
         known: dict[str, object] = {
-            "sticks": here / "media", "folder": self.state, "wishes": self.requests, "keyring": here / "ca.crt",
-            "rauc": (sys.executable, "-IS", str(RAUC), str(here)), "instrument": self.instrument,
-            "restart": ("touch", str(here / "off")), "answer_s": 2.0, "patience_s": self.patience_s,
+            "sticks": here / "media",
+            "folder": self.state,
+            "wishes": self.requests,
+            "keyring": here / "ca.crt",
+            "rauc": (sys.executable, "-IS", str(RAUC), str(here)),
+            "instrument": self.instrument,
+            "restart": ("touch", str(here / "off")),
+            "answer_s": 2.0,
+            "patience_s": self.patience_s,
             "modules": here / "modules",
-        }  # fmt: skip
+        }
         return UpdateSettings(**known | changed)  # type: ignore[arg-type]
 
     def updater(self, runs: str, **changed: object) -> Updater:

@@ -19,9 +19,9 @@ def shuffled(psf: Image, blocks: int = 8, seed: int = 0) -> Image:
     image = np.zeros_like(psf)
     parts = psf[: rows * blocks, : cols * blocks].reshape(blocks, rows, blocks, cols).swapaxes(1, 2)
     mixed = parts.reshape(-1, rows, cols)[np.random.default_rng(seed).permutation(blocks**2)]
-    image[: rows * blocks, : cols * blocks] = mixed.reshape(blocks, blocks, rows, cols).swapaxes(1, 2).reshape(
-        rows * blocks, cols * blocks
-    )  # fmt: skip
+    image[: rows * blocks, : cols * blocks] = (
+        mixed.reshape(blocks, blocks, rows, cols).swapaxes(1, 2).reshape(rows * blocks, cols * blocks)
+    )
     return image
 
 

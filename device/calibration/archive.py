@@ -213,16 +213,19 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     table["unknown"] = list(provenance.unknown)
     return {
         "format": _format(calibration),
-        "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
+        "id": calibration.id,
+        "simulated": calibration.simulated,
+        "field_deg": calibration.field_deg,
         "psf_names": [psf.name for psf in calibration.psfs],
         "psf_colours": [psf.colour or "every" for psf in calibration.psfs],
         "sensor": asdict(calibration.sensor),
         "geometry": asdict(calibration.geometry) if calibration.geometry else None,
         "refraction_offset": asdict(calibration.refraction_offset) if calibration.refraction_offset else None,
         "white": dict(calibration.white.dn_per_s) if calibration.white else None,
-        "provenance": table, "figures": dict(provenance.figures),
+        "provenance": table,
+        "figures": dict(provenance.figures),
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in arrays.items()},
-    }  # fmt: skip
+    }
 
 
 def _format(calibration: Calibration) -> int:

@@ -20,8 +20,13 @@ from device.optics.trial_lens import EMMETROPIC, PowerVector, TrialLens, correct
 from device.values import RefractionOffset
 
 TRIAL_LENSES = (
-    TrialLens(0.0), TrialLens(2.0), TrialLens(-2.0), TrialLens(5.0), TrialLens(-5.0), TrialLens(0.0, -2.0, 30.0)
-)  # fmt: skip
+    TrialLens(0.0),
+    TrialLens(2.0),
+    TrialLens(-2.0),
+    TrialLens(5.0),
+    TrialLens(-5.0),
+    TrialLens(0.0, -2.0, 30.0),
+)
 LENS_SD_DPT = 0.06  # tolerance of a trial lens up to 6 dpt, ISO 9801 [unchecked]
 VERTEX_SD_MM = 1.0  # of a distance taken with a ruler: 0.025 dpt at 5 dpt
 LEAST_SPHERES = 3  # different ones: two fix the line, and one judges it
@@ -77,9 +82,11 @@ class TrialLensFit:
     def figures(self) -> tuple[tuple[str, float], ...]:
         """Figures for the provenance of the calibration that takes the offset."""
         return (
-            ("trial_slope", self.slope), ("trial_slope_sd", self.slope_sd),
-            ("trial_cylinder_error_dpt", self.cylinder_error_dpt), ("trial_axis_error_deg", self.axis_error_deg),
-        )  # fmt: skip
+            ("trial_slope", self.slope),
+            ("trial_slope_sd", self.slope_sd),
+            ("trial_cylinder_error_dpt", self.cylinder_error_dpt),
+            ("trial_axis_error_deg", self.axis_error_deg),
+        )
 
 
 class _Line(NamedTuple):
@@ -107,9 +114,14 @@ def fit_trial_lenses(readings: Sequence[LensReading], vertex_mm: float, eye: Pow
     offset = RefractionOffset(line.offset_dpt, j0_dpt, j45_dpt, line.offset_sd_dpt, j0_sd, j45_sd)
     (cylinder,) = (pair for pair in zip(readings, nominals, strict=True) if pair[0].lens.cylinder_dpt)
     fit = TrialLensFit(
-        offset, line.slope, line.slope_sd, *_cylinder_errors(*cylinder, offset, eye),
-        nominals, tuple(line.residuals_dpt.tolist()), (),
-    )  # fmt: skip
+        offset,
+        line.slope,
+        line.slope_sd,
+        *_cylinder_errors(*cylinder, offset, eye),
+        nominals,
+        tuple(line.residuals_dpt.tolist()),
+        (),
+    )
     return _judged(fit, line, readings)
 
 

@@ -39,10 +39,24 @@ MEASURE_PSF = "Give an image of one point of light in a dark room, neither satur
 READABLE = (*SUFFIXES, ".npz", ".dng")
 Pixels = NDArray[Any]
 _DECODER_ERRORS = (  # exceptions of the decoders on truncated or damaged files
-    ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError, AssertionError,
-    RuntimeError, UnidentifiedImageError, tifffile.TiffFileError,
-    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
-)  # fmt: skip
+    ValueError,
+    EOFError,
+    OSError,
+    SyntaxError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    MemoryError,
+    AssertionError,
+    RuntimeError,
+    UnidentifiedImageError,
+    tifffile.TiffFileError,
+    Pillow.DecompressionBombError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+    TokenError,
+)
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,24 @@ _LETTER_RATIO = 1 / 18  # letter size of the band over picture height: legible o
 _LETTER_LEAST_PX = 12.0  # smaller letters touch each other
 _WORDS = {True: "true", False: "false"}
 _UNREADABLE = (
-    OSError, ValueError, TypeError, LookupError, SyntaxError, EOFError, AttributeError, ArithmeticError, AssertionError,
-    MemoryError, NotImplementedError, RuntimeError, struct.error, zlib.error, zipfile.BadZipFile,
-    tifffile.TiffFileError, Pillow.DecompressionBombError,
-)  # fmt: skip
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    SyntaxError,
+    EOFError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    MemoryError,
+    NotImplementedError,
+    RuntimeError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+    tifffile.TiffFileError,
+    Pillow.DecompressionBombError,
+)
 
 Pixels = NDArray[np.uint8]
 Stated = bool | None  # what a file states: simulated, not simulated, or nothing

@@ -25,12 +25,19 @@ _WHOLE_PAGE = (0, 2)  # NewSubfileType: a full-resolution image, or one page of 
 _ALPHA = (1, 2)  # ExtraSamples: associated and unassociated alpha; 0 is unspecified
 # Tags that change the meaning of values or their places, with the value that changes nothing (None: there is none).
 _NOT_APPLIED: dict[int, tuple[str, tuple[float, ...] | None]] = {
-    291: ("GrayResponseCurve", None), 301: ("TransferFunction", None), 433: ("Decode", None),
-    346: ("Indexed", (0,)), 532: ("ReferenceBlackWhite", (0, 255, 0, 255, 0, 255)), 32997: ("ImageDepth", (1,)),
-    50711: ("CFALayout", (1,)), 50718: ("DefaultScale", (1, 1)), 50974: ("SubTileBlockSize", (1, 1)),
-    50975: ("RowInterleaveFactor", (1,)), 52547: ("ColumnInterleaveFactor", (1,)),
+    291: ("GrayResponseCurve", None),
+    301: ("TransferFunction", None),
+    433: ("Decode", None),
+    346: ("Indexed", (0,)),
+    532: ("ReferenceBlackWhite", (0, 255, 0, 255, 0, 255)),
+    32997: ("ImageDepth", (1,)),
+    50711: ("CFALayout", (1,)),
+    50718: ("DefaultScale", (1, 1)),
+    50974: ("SubTileBlockSize", (1, 1)),
+    50975: ("RowInterleaveFactor", (1,)),
+    52547: ("ColumnInterleaveFactor", (1,)),
     51125: ("DefaultUserCrop", (0, 0, 1, 1)),
-}  # fmt: skip
+}
 _OPERATIONS = {51008: "OpcodeList1", 51009: "OpcodeList2", 51022: "OpcodeList3"}
 _MISSING_VALUE = 42113  # GDAL_NODATA
 _PROFILE = 34675  # InterColorProfile

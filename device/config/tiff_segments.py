@@ -142,9 +142,16 @@ def _decompressed(data: bytes, code: int, rows: int, line_bytes: int) -> bytes:
     if code in (_DEFLATE, _OLD_DEFLATE):
         return zlib.decompressobj().decompress(data, rows * line_bytes + 1)
     tags = {
-        256: line_bytes, 257: rows, 258: 8, 259: code, 262: 1, 273: 8 + 2 + 9 * 12 + 4, 277: 1, 278: rows,
+        256: line_bytes,
+        257: rows,
+        258: 8,
+        259: code,
+        262: 1,
+        273: 8 + 2 + 9 * 12 + 4,
+        277: 1,
+        278: rows,
         279: len(data),
-    }  # fmt: skip
+    }
     directory = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
     header = struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + directory + bytes(4)
     with Pillow.open(BytesIO(header + data), formats=("TIFF",)) as picture:

@@ -90,8 +90,12 @@ def _known_keys(kind: type[Table], tables: list[str]) -> list[str]:
 
 def _key_paths(kind: type[Table]) -> list[str]:
     """Return the dotted paths of all permitted keys, those of outer tables before those of inner ones."""
-    inner = [f"{name}.{path}" for name in kind.model_fields if _is_table(kind, name) for path in
-             _key_paths(_table(kind, [name]))]  # fmt: skip
+    inner = [
+        f"{name}.{path}"
+        for name in kind.model_fields
+        if _is_table(kind, name)
+        for path in _key_paths(_table(kind, [name]))
+    ]
     return [*kind.model_fields, *sorted(inner, key=lambda path: path.count("."))]
 
 

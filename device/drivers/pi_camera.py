@@ -94,8 +94,11 @@ class PiCamera(RetryingCamera):
             raw={"format": f"{mosaic}{spec.bit_depth}", "size": size},
             sensor={"output_size": size, "bit_depth": spec.bit_depth},
             controls=self._controls(device, exposure_s),
-            buffer_count=BUFFERS, queue=False, display=None, encode=None,
-        )  # fmt: skip
+            buffer_count=BUFFERS,
+            queue=False,
+            display=None,
+            encode=None,
+        )
         device.configure(asked)
         self._layout = self._granted_layout(device.camera_configuration())
         device.start()

@@ -19,18 +19,30 @@ class Capability(ctypes.Structure):
     """struct v4l2_capability."""
 
     _fields_ = (
-        ("driver", ctypes.c_char * 16), ("card", ctypes.c_char * 32), ("bus_info", ctypes.c_char * 32),
-        ("version", U32), ("capabilities", U32), ("device_caps", U32), ("reserved", U32 * 3),
-    )  # fmt: skip
+        ("driver", ctypes.c_char * 16),
+        ("card", ctypes.c_char * 32),
+        ("bus_info", ctypes.c_char * 32),
+        ("version", U32),
+        ("capabilities", U32),
+        ("device_caps", U32),
+        ("reserved", U32 * 3),
+    )
 
 
 class Format(ctypes.Structure):
     """struct v4l2_format with its struct v4l2_pix_format."""
 
     _fields_ = (
-        ("type", U32), ("_pad", U32), ("width", U32), ("height", U32), ("fourcc", ctypes.c_char * 4), ("field", U32),
-        ("bytesperline", U32), ("sizeimage", U32), ("_rest", ctypes.c_uint8 * 176),
-    )  # fmt: skip
+        ("type", U32),
+        ("_pad", U32),
+        ("width", U32),
+        ("height", U32),
+        ("fourcc", ctypes.c_char * 4),
+        ("field", U32),
+        ("bytesperline", U32),
+        ("sizeimage", U32),
+        ("_rest", ctypes.c_uint8 * 176),
+    )
 
 
 class Buffers(ctypes.Structure):
@@ -43,10 +55,21 @@ class Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
     _fields_ = (
-        ("index", U32), ("type", U32), ("bytesused", U32), ("flags", U32), ("field", U32), ("_pad", U32),
-        ("seconds", ctypes.c_int64), ("microseconds", ctypes.c_int64), ("timecode", ctypes.c_uint8 * 16),
-        ("sequence", U32), ("memory", U32), ("offset", ctypes.c_uint64), ("length", U32), ("_rest", U32 * 3),
-    )  # fmt: skip
+        ("index", U32),
+        ("type", U32),
+        ("bytesused", U32),
+        ("flags", U32),
+        ("field", U32),
+        ("_pad", U32),
+        ("seconds", ctypes.c_int64),
+        ("microseconds", ctypes.c_int64),
+        ("timecode", ctypes.c_uint8 * 16),
+        ("sequence", U32),
+        ("memory", U32),
+        ("offset", ctypes.c_uint64),
+        ("length", U32),
+        ("_rest", U32 * 3),
+    )
 
 
 class Control(ctypes.Structure):

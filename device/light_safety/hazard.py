@@ -194,9 +194,12 @@ NO_LIGHT: Radiometry = {colour: Beam(led.wavelength_um, 0.0, 0.0) for colour, le
 
 
 def radiometry(
-    measured: RadiometrySpec | None = None, field_deg: float = FIELD_DEG, leds: int = LEDS,
-    lamps: Mapping[Colour, Lamp] | None = None, magnification: float = RELAY_MAGNIFICATION,
-) -> Radiometry:  # fmt: skip
+    measured: RadiometrySpec | None = None,
+    field_deg: float = FIELD_DEG,
+    leds: int = LEDS,
+    lamps: Mapping[Colour, Lamp] | None = None,
+    magnification: float = RELAY_MAGNIFICATION,
+) -> Radiometry:
     """Return the beam of each colour: as measured, times the guard factor; if unmeasured, the worst case.
 
     `lamps` are the head's LEDs by colour; None: `leds` LEDs of an APA102-2020 in each of its colours. `magnification`
@@ -216,9 +219,12 @@ def radiometry(
 
 
 def worst_beam(
-    colour: Colour, field_deg: float = FIELD_DEG, leds: int = LEDS, led: Led | None = None,
+    colour: Colour,
+    field_deg: float = FIELD_DEG,
+    leds: int = LEDS,
+    led: Led | None = None,
     magnification: float = RELAY_MAGNIFICATION,
-) -> Beam:  # fmt: skip
+) -> Beam:
     """Return the worst-case beam of an unmeasured colour: lossless optics, and LEDs brighter by the uncertainty factor.
 
     `retina` holds the light of all `leds` LEDs, `waist` that of one LED: the LEDs are further apart than the disc of 1

@@ -146,9 +146,22 @@ def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
     colour = spec.light.colour
     lamp = (lamps_of(spec) or {}).get(colour) or Lamp(LED[colour], len(ring(chain)))
     found = Design(
-        spec.name, path, spec.optics, chain, camera.rows, camera.cols, camera.pitch_um, path.eye.focal_mm, pupil_mm,
-        colour, camera.exposure_s, lamp.led, lamp.emitter_mm, camera.read_noise_e, spec.light.radiometry,
-    )  # fmt: skip
+        spec.name,
+        path,
+        spec.optics,
+        chain,
+        camera.rows,
+        camera.cols,
+        camera.pitch_um,
+        path.eye.focal_mm,
+        pupil_mm,
+        colour,
+        camera.exposure_s,
+        lamp.led,
+        lamp.emitter_mm,
+        camera.read_noise_e,
+        spec.light.radiometry,
+    )
     if found.measured is None:
         return found
     times = found.measured.retina_mw_per_cm2 / found.highest_mw_per_cm2
@@ -163,17 +176,29 @@ def lit_area_cm2(field_deg: float, eye_mm: float = 17.0) -> float:
 def _whole_light(design: Design) -> PhotonBudget:
     """Return the photon budget of the whole ring, whatever the eye's pupil."""
     return photon_budget(
-        design.colour, design.pitch_um, design.optics.field_deg, design.eye_mm, design.relay, len(ring(design.chain)),
+        design.colour,
+        design.pitch_um,
+        design.optics.field_deg,
+        design.eye_mm,
+        design.relay,
+        len(ring(design.chain)),
         design.led,
-    )  # fmt: skip
+    )
 
 
 def design_of_sensor(path: LightPath, sensor: SensorProfile) -> Design:
     """Return the design of the light path `path` with a sensor profile at full resolution, green light and 0.1 s."""
     return Design(
-        sensor.title, path, path.optics, path.ring, sensor.rows, sensor.cols, sensor.pitch_um,
-        path.eye.focal_mm, path.eye.pupil_mm,
-    )  # fmt: skip
+        sensor.title,
+        path,
+        path.optics,
+        path.ring,
+        sensor.rows,
+        sensor.cols,
+        sensor.pitch_um,
+        path.eye.focal_mm,
+        path.eye.pupil_mm,
+    )
 
 
 def optical_budget(design: Design) -> OpticalBudget:

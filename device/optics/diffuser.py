@@ -167,9 +167,14 @@ def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
 
 
 def caustic(
-    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
-    beam: Beam | None = None, element: DiffuserSpec = RANDOM_SURFACE,
-) -> Image:  # fmt: skip
+    optics: OpticsSpec,
+    pitch_um: float,
+    seed: int,
+    refraction: Refraction = EMMETROPIA,
+    lines: int = 3,
+    beam: Beam | None = None,
+    element: DiffuserSpec = RANDOM_SURFACE,
+) -> Image:
     """Return the intensity on the sensor from one retinal point on the axis by wave optics: float32 (n, n), sum 1.
 
     With a `beam` that does not fill the iris, the sum is the transmitted share, below 1. `seed` selects the diffuser.
@@ -181,9 +186,14 @@ def caustic(
 
 
 def caustic_on(
-    grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
-    beam: Beam | None = None, element: DiffuserSpec = RANDOM_SURFACE,
-) -> Image:  # fmt: skip
+    grid: Grid,
+    optics: OpticsSpec,
+    seed: int,
+    refraction: Refraction = EMMETROPIA,
+    lines: int = 3,
+    beam: Beam | None = None,
+    element: DiffuserSpec = RANDOM_SURFACE,
+) -> Image:
     """Return the result of `caustic` on a given grid, (pixels, pixels); SpecError for a grid too coarse or small."""
     require_sampling(
         grid.samples,

@@ -25,8 +25,10 @@ class Glass(Table):
     def index(self, wavelength_um: float) -> float:
         """Return the refractive index against air; SpecError outside the range of the coefficients."""
         if not self.from_um <= wavelength_um <= self.to_um:
-            raise SpecError(f"a wavelength of {wavelength_um:g} um is outside {self.from_um:g} to {self.to_um:g} um",
-                            "Choose a wavelength for which the glass's coefficients hold.")  # fmt: skip
+            raise SpecError(
+                f"a wavelength of {wavelength_um:g} um is outside {self.from_um:g} to {self.to_um:g} um",
+                "Choose a wavelength for which the glass's coefficients hold.",
+            )
         square = wavelength_um**2
         if self.series == "sellmeier":
             pairs = zip(self.coefficients[:3], self.coefficients[3:], strict=True)

@@ -41,9 +41,11 @@ LED: dict[Colour, Led] = {
 PEAK_UM: dict[Colour, float] = {colour: led.wavelength_um for colour, led in LED.items()} | {"amber": 0.590}
 # Wavelength, um, with the reflectance and the quantum efficiency there; at 590 nm both are estimates (OPTICS.md 4.1).
 RESPONSE = (
-    (0.467, LED["blue"].reflectance, 0.445), (0.522, LED["green"].reflectance, 0.58),
-    (0.590, 0.030, 0.61), (0.622, LED["red"].reflectance, 0.60),
-)  # fmt: skip
+    (0.467, LED["blue"].reflectance, 0.445),
+    (0.522, LED["green"].reflectance, 0.58),
+    (0.590, 0.030, 0.61),
+    (0.622, LED["red"].reflectance, 0.60),
+)
 
 
 def led_at(wavelength_um: float, power_mw: float) -> Led:
@@ -73,9 +75,15 @@ def half_cone_deg(field_deg: float, magnification: float = RELAY_MAGNIFICATION) 
 
 
 def photon_budget(
-    colour: Colour, pitch_um: float, field_deg: float = 33.4, eye_mm: float = 17.0, relay: Relay | None = None,
-    leds: int = LEDS, led: Led | None = None, half_cone: float | None = None,
-) -> PhotonBudget:  # fmt: skip
+    colour: Colour,
+    pitch_um: float,
+    field_deg: float = 33.4,
+    eye_mm: float = 17.0,
+    relay: Relay | None = None,
+    leds: int = LEDS,
+    led: Led | None = None,
+    half_cone: float | None = None,
+) -> PhotonBudget:
     """Return the budget of `leds` LEDs at full drive, spread over the field of a human eye, collected by the iris.
 
     `eye_mm` is the eye's focal length; `relay` None: the paper's; `led` None: that colour of an APA102-2020;

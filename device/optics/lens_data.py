@@ -57,8 +57,10 @@ class LayoutSpec(Table):
 def named_glass(glasses: dict[str, Glass], name: str, user: str) -> Glass:
     """Return a glass by name; SpecError names the lens whose glass is missing."""
     if name not in glasses:
-        raise SpecError(f"glass {name!r} of {user} is not in the file",
-                        f"Add a table [glass.\"{name}\"], or choose one of {', '.join(sorted(glasses))}.")  # fmt: skip
+        raise SpecError(
+            f"glass {name!r} of {user} is not in the file",
+            f'Add a table [glass."{name}"], or choose one of {", ".join(sorted(glasses))}.',
+        )
     return glasses[name]
 
 

@@ -112,21 +112,41 @@ def _lamp(design: Design, level: float) -> list[Factor]:
         Factor("drive", level, "", 0.0, "safety", "full drive, or what the light limits permit", 1.0),
         Factor("LEDs", len(ring(design.chain)), "", 0.0, "LED", places),
         Factor("power of an LED", design.led.power_mw, "mW", 0.35, "LED", "estimate; a factor of two until measured"),
-        Factor(CONE, sin(radians(half_deg)) ** 2, "", 0.1, "coupling",
-               f"sin^2 of {half_deg:.1f} deg, Lambertian emitter", 1.0),
+        Factor(
+            CONE,
+            sin(radians(half_deg)) ** 2,
+            "",
+            0.1,
+            "coupling",
+            f"sin^2 of {half_deg:.1f} deg, Lambertian emitter",
+            1.0,
+        ),
         Factor("polariser", 0.42, "", 0.1, "polarisers", "film, unpolarised light", 1.0),
         Factor("splitter to the eye", 0.5, "", 0.05, "splitter", "50:50 plate", 1.0),
         Factor("relay to the eye", 0.9, "", 0.03, "coupling", "four doublets, coated", 1.0),
-    ]  # fmt: skip
+    ]
 
 
 def _into_eye(design: Design) -> list[Factor]:
     return [
-        Factor("share in the pupil", design.share_in_pupil, "", 0.1, "coupling",
-               f"image of ring and emitter in a pupil of {design.pupil_mm:g} mm", 1.0),
-        Factor("lit retina", 1 / lit_area_cm2(design.optics.field_deg, design.eye_mm), "/cm2", 0.1, "eye",
-               f"{design.optics.field_deg:g} deg, f = {design.eye_mm:g} mm"),
-    ]  # fmt: skip
+        Factor(
+            "share in the pupil",
+            design.share_in_pupil,
+            "",
+            0.1,
+            "coupling",
+            f"image of ring and emitter in a pupil of {design.pupil_mm:g} mm",
+            1.0,
+        ),
+        Factor(
+            "lit retina",
+            1 / lit_area_cm2(design.optics.field_deg, design.eye_mm),
+            "/cm2",
+            0.1,
+            "eye",
+            f"{design.optics.field_deg:g} deg, f = {design.eye_mm:g} mm",
+        ),
+    ]
 
 
 def _from_eye(design: Design) -> list[Factor]:
@@ -134,15 +154,28 @@ def _from_eye(design: Design) -> list[Factor]:
     pupil_cm2 = pi * (design.pupil_mm / 20) ** 2
     lit_sr = pi * tan(radians(design.optics.field_deg / 2)) ** 2
     return [
-        Factor("radiance of the fundus", design.led.reflectance / pi, "/sr", 0.3, "eye",
-               "Delori and Pflibsen 1989, Table I; persons differ by 25 to 50 %"),
-        Factor("iris at the eye", iris_cm2, "cm2", 0.03, "pupil", f"{design.relay.iris_at_eye_mm:.2f} mm wide",
-               max(pupil_cm2, iris_cm2)),
+        Factor(
+            "radiance of the fundus",
+            design.led.reflectance / pi,
+            "/sr",
+            0.3,
+            "eye",
+            "Delori and Pflibsen 1989, Table I; persons differ by 25 to 50 %",
+        ),
+        Factor(
+            "iris at the eye",
+            iris_cm2,
+            "cm2",
+            0.03,
+            "pupil",
+            f"{design.relay.iris_at_eye_mm:.2f} mm wide",
+            max(pupil_cm2, iris_cm2),
+        ),
         Factor("solid angle of the field", lit_sr, "sr", 0.02, "eye", "lit area over the square of f"),
         Factor("relay from the eye", 0.9, "", 0.03, "coupling", "four doublets, coated", 1.0),
         Factor("splitter from the eye", 0.5, "", 0.05, "splitter", "50:50 plate", 1.0),
         Factor("crossed polariser", 0.40, "", 0.2, "polarisers", "of depolarised light; an estimate", 1.0),
-    ]  # fmt: skip
+    ]
 
 
 def _sensor(design: Design, frames: int) -> list[Factor]:

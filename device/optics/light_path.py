@@ -122,6 +122,9 @@ def led_ray_mm(path: LightPath, relay: Relay, led_mm: float, angle_deg: float) -
     back = led_mm / relay.second_mm  # all rays of one LED are parallel between the lenses
     at_first = at_second - back * (second - first)
     return [
-        (plate + led_mm, path.relay.splitter_to_iris_mm), met, (second, at_second), (first, at_first),
+        (plate + led_mm, path.relay.splitter_to_iris_mm),
+        met,
+        (second, at_second),
+        (first, at_first),
         (0.0, -led_mm / relay.pupil_magnification),
-    ]  # fmt: skip
+    ]

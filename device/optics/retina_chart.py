@@ -102,10 +102,15 @@ class Ring:
 Element = BarGroup | Disc | Ring
 
 BAR_GROUPS = (
-    BarGroup(712, 1500, 250, True), BarGroup(-506, 1500, 315, False), BarGroup(3200, -1500, 400, True),
-    BarGroup(1600, -1500, 500, False), BarGroup(-312, -1500, 630, True), BarGroup(-2600, -1500, 800, False),
-    BarGroup(-2650, 1500, 1000, True), BarGroup(2900, 2100, 1250, False),
-)  # fmt: skip
+    BarGroup(712, 1500, 250, True),
+    BarGroup(-506, 1500, 315, False),
+    BarGroup(3200, -1500, 400, True),
+    BarGroup(1600, -1500, 500, False),
+    BarGroup(-312, -1500, 630, True),
+    BarGroup(-2600, -1500, 800, False),
+    BarGroup(-2650, 1500, 1000, True),
+    BarGroup(2900, 2100, 1250, False),
+)
 MARKS = tuple(
     Disc(right * MARKS_APART_UM / 2, down * MARKS_APART_UM / 2, MARK_UM)
     for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1))

@@ -31,8 +31,15 @@ RIM = 180  # rays on the rim of the pupil, which bound the beam
 NEAR_DEG = 0.05  # field angle of the paraxial limit
 CLOSE_RAD = 1e-4  # between the close rays of a focus
 # Half ranges of a built relay (OPTICS.md 6.3): focal lengths by the maker's 1 %, places by hand and ruler [estimate].
-TOLERANCES = {"gap_mm": 0.25, "separation_mm": 0.5, "pupil_axial_mm": 1.0, "pupil_lateral_mm": 0.3,
-              "iris_axial_mm": 0.5, "first_scale": 0.01, "second_scale": 0.01}  # fmt: skip
+TOLERANCES = {
+    "gap_mm": 0.25,
+    "separation_mm": 0.5,
+    "pupil_axial_mm": 1.0,
+    "pupil_lateral_mm": 0.3,
+    "iris_axial_mm": 0.5,
+    "first_scale": 0.01,
+    "second_scale": 0.01,
+}
 SPIRAL = pi * (3 - 5**0.5)  # golden angle: points of a disc without rows
 
 
@@ -122,8 +129,10 @@ class TracedRelay:
         The LED is `led_mm` off its axis, and the ray at `angle_deg` to it.
         """
         start = np.array([[0, led_mm, -self.lamp_at_mm]])
-        beam = trace(reversed_surfaces(self.lamp_surfaces),
-                     rays(start, np.array([0, sin(radians(angle_deg)), cos(radians(angle_deg))])))  # fmt: skip
+        beam = trace(
+            reversed_surfaces(self.lamp_surfaces),
+            rays(start, np.array([0, sin(radians(angle_deg)), cos(radians(angle_deg))])),
+        )
         if not len(beam.numbers):
             return inf, inf
         return float(at_plane(beam, 0.0)[0, 1]), degrees(asin(float(beam.directions[0, 1])))
@@ -140,8 +149,9 @@ def traced_relay(
         raise SpecError("the light path has no [layout]: no real lenses to trace", "Add [layout], [lens] and [glass].")
     wavelength = wavelength_um or path.optics.wavelength_um
     pairs = _pairs(path, path.layout, wavelength, deviation.gap_mm)
-    first, second = (_scaled(pair, scale) for pair, scale in
-                     zip(pairs, (deviation.first_scale, deviation.second_scale), strict=True))  # fmt: skip
+    first, second = (
+        _scaled(pair, scale) for pair, scale in zip(pairs, (deviation.first_scale, deviation.second_scale), strict=True)
+    )
     one, two = paraxial(pairs[0]), paraxial(pairs[1])  # the tube is made for the nominal lenses
     first = moved(first, one.front_mm)
     apart = pairs[0][-1].at_mm + one.front_mm + one.back_mm + two.front_mm + deviation.separation_mm
@@ -149,9 +159,16 @@ def traced_relay(
     lamp_at_mm = apart + pairs[1][-1].at_mm + two.back_mm
     plate = _plate(path, path.layout, wavelength, lamp_at_mm - path.relay.splitter_to_iris_mm)
     found = TracedRelay(
-        (*first, *second, *plate), (*first, *second), one, two, lamp_at_mm, lamp_at_mm,
-        path.eye.pupil_mm, path.optics.iris_um / 1000, deviation,
-    )  # fmt: skip
+        (*first, *second, *plate),
+        (*first, *second),
+        one,
+        two,
+        lamp_at_mm,
+        lamp_at_mm,
+        path.eye.pupil_mm,
+        path.optics.iris_um / 1000,
+        deviation,
+    )
     nominal = found if deviation == Deviation() else traced_relay(path, wavelength)
     at_mm = _image_of_pupil(nominal) if nominal is found else nominal.iris_at_mm
     return replace(found, iris_at_mm=at_mm + deviation.iris_axial_mm)
@@ -247,8 +264,10 @@ def retina_point(
     """
     if path.layout is None:
         raise SpecError("the light path has no [layout]: no real lenses to trace", "Add [layout], [lens] and [glass].")
-    lens = moved(lens_surfaces(path.lens, path.glass, path.layout.eye_lens, path.optics.wavelength_um),
-                 path.layout.pupil_to_eye_lens_mm)  # fmt: skip
+    lens = moved(
+        lens_surfaces(path.lens, path.glass, path.layout.eye_lens, path.optics.wavelength_um),
+        path.layout.pupil_to_eye_lens_mm,
+    )
     at_mm = lens[-1].at_mm + (eye_to_screen_mm or paraxial(lens).back_mm)
     retina = Surface(at_mm, -(retina_radius_mm or path.layout.retina_radius_mm), 1.0, name="the retina")
     inward, out = without_rims((*lens, retina)), radians(angle_deg)

@@ -84,9 +84,14 @@ class BurstJoiner:
     """
 
     def __init__(
-        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock, index: int = 0,
+        self,
+        calibration: Calibration,
+        shape: tuple[int, int],
+        planner: Planner,
+        clock: Clock,
+        index: int = 0,
         single: Reconstructor | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         coarse, fine = default_schedule(calibration, shape, index)
         if min(shape) // coarse.bin < LEAST_COARSE or not isfinite(field_radius_px(calibration)):
             single = None
@@ -107,9 +112,12 @@ class BurstJoiner:
         return joined
 
     def steps(
-        self, frames: Sequence[Pixels], unusable: Mapping[int, str] | None = None, dark: Pixels | None = None,
+        self,
+        frames: Sequence[Pixels],
+        unusable: Mapping[int, str] | None = None,
+        dark: Pixels | None = None,
         ready: Mapping[int, SeenFrame] | None = None,
-    ) -> Iterator[RoundDone | JoinedFrame]:  # fmt: skip
+    ) -> Iterator[RoundDone | JoinedFrame]:
         """Join frames (rows, cols) in counts; `dark` is their dark frame (None: the calibration's).
 
         Yields ROUND_DONE after the picture of each frame that is not `ready` (by index, with the same dark frame), then

@@ -73,10 +73,15 @@ class BurstReconstructor:
         return PreparedFrame(look, seen, task)
 
     def steps(
-        self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,
-        deadline: Deadline | None = None, unusable: Mapping[int, str] | None = None,
+        self,
+        frames: Sequence[Pixels],
+        dark: Pixels | None = None,
+        *,
+        simulated: bool,
+        deadline: Deadline | None = None,
+        unusable: Mapping[int, str] | None = None,
         prepared: Mapping[int, PreparedFrame] | None = None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         """Yield the quick look of the first frame, RoundDone after each frame and round, and the picture of the burst.
 
         `frames` are uint16 or float32 (rows, cols), all with the dark frame `dark`; `unusable` holds the reason of each
@@ -144,9 +149,12 @@ class _Run:
         return self._deadline is None or self._deadline.fits(cost_s)
 
     def join(
-        self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str] | None = None,
+        self,
+        frames: Sequence[Pixels],
+        dark: Pixels | None,
+        unusable: Mapping[int, str] | None = None,
         ready: Mapping[int, SeenFrame] | None = None,
-    ) -> Iterator[RoundDone]:  # fmt: skip
+    ) -> Iterator[RoundDone]:
         """Join the frames; yield RoundDone after each that is not ready. The deadline moves by the consumer's time."""
         owner = self._owner
         begin_s = owner.clock.now_s()
@@ -163,17 +171,26 @@ class _Run:
             self._deadline = None if self._deadline is None else self._deadline.later(begin_s - paused_s)
 
     def solve_joined(
-        self, used: Sequence[Pixels], dark: Pixels | None, saturated: float | None, simulated: bool,
+        self,
+        used: Sequence[Pixels],
+        dark: Pixels | None,
+        saturated: float | None,
+        simulated: bool,
         refraction: RefractionTask | None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         """Yield the steps of the picture of the joined frames `used`; `saturated` and `refraction` are the first's."""
         owner, joined = self._owner, self.joined
         assert joined is not None
         total, is_solved = joined.counts * np.float32(joined.light), False
         for step in owner.single.steps(
-            used[0], dark, simulated=simulated, deadline=self._deadline, joined=total, refraction=refraction,
+            used[0],
+            dark,
+            simulated=simulated,
+            deadline=self._deadline,
+            joined=total,
+            refraction=refraction,
             others=used[1:],
-        ):  # fmt: skip
+        ):
             if isinstance(step, RoundDone):
                 yield step
             elif isinstance(step, Reconstruction) and is_solved:
@@ -187,9 +204,14 @@ class _Run:
                 yield replace(step, picture=step.picture / np.float32(joined.light))
 
     def solve_one(
-        self, counts: Pixels, dark: Pixels | None, uses: Sequence[FrameUse], index: int, simulated: bool,
+        self,
+        counts: Pixels,
+        dark: Pixels | None,
+        uses: Sequence[FrameUse],
+        index: int,
+        simulated: bool,
         refraction: RefractionTask | None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         """Yield the steps of the picture of one frame, the one with this index; `uses` says why no other is used.
 
         `refraction`: its task, if it has begun.

@@ -60,10 +60,16 @@ class ColourReconstructor:
             self._join({"green": noise, **dict.fromkeys(others, noise)}, 1, {})  # measures the cost
 
     def steps(
-        self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
-        deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+        self,
+        green: Iterator[Step],
+        frames: Mapping[Colour, Pixels],
+        dark: Pixels | None = None,
+        *,
+        simulated: bool,
+        deadline: Deadline | None = None,
+        missing: Mapping[Colour, str] | None = None,
         lights_dn_per_s: Mapping[Colour, float] | None = None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         """Yield the steps of `green`, RoundDone after each round of the other colours, and the picture in colour.
 
         `frames`: one frame of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason

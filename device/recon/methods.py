@@ -78,32 +78,52 @@ METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         Method(
-            "tikhonov", "the paper's closed form: periodic, L2 prior, mu by cross-validation",
-            lambda model, _, __: ClosedForm(model, TIKHONOV), start_pairs=1, images=6, periodic=True, settings=(MU,),
+            "tikhonov",
+            "the paper's closed form: periodic, L2 prior, mu by cross-validation",
+            lambda model, _, __: ClosedForm(model, TIKHONOV),
+            start_pairs=1,
+            images=6,
+            periodic=True,
+            settings=(MU,),
         ),
         Method(
-            "gradient", "flat field taken out first, gradient prior with an L2 floor, mu by cross-validation",
-            lambda model, _, __: ClosedForm(model, GRADIENT), start_pairs=1, images=6, settings=(MU,),
+            "gradient",
+            "flat field taken out first, gradient prior with an L2 floor, mu by cross-validation",
+            lambda model, _, __: ClosedForm(model, GRADIENT),
+            start_pairs=1,
+            images=6,
+            settings=(MU,),
         ),
         Method(
-            "evidence", "shading taken out first, Wiener filter with the prior that the frame's evidence supports",
-            lambda model, calibration, _: EvidenceWiener(model, calibration), start_pairs=2, images=12,
+            "evidence",
+            "shading taken out first, Wiener filter with the prior that the frame's evidence supports",
+            lambda model, calibration, _: EvidenceWiener(model, calibration),
+            start_pairs=2,
+            images=12,
             settings=(PRIOR_SLOPE, PRIOR_LOG_POWER),
         ),
         Method(
-            "variation", "crop-aware, noise-weighted total variation, positive; starts from `evidence`",
+            "variation",
+            "crop-aware, noise-weighted total variation, positive; starts from `evidence`",
             lambda model, calibration, planner: TotalVariation(model, calibration, planner),
-            start_pairs=3, round_pairs=2, rounds=TotalVariation.rounds, images=22,
+            start_pairs=3,
+            round_pairs=2,
+            rounds=TotalVariation.rounds,
+            images=22,
             settings=(TAU, PRIOR_SLOPE, PRIOR_LOG_POWER),
         ),
         Method(
-            "open", "the same where no field is known: weights and tau from what the frame itself leaves open",
+            "open",
+            "the same where no field is known: weights and tau from what the frame itself leaves open",
             lambda model, calibration, planner: OpenFieldTotalVariation(model, calibration, planner),
-            start_pairs=4, round_pairs=2, rounds=OpenFieldTotalVariation.rounds, images=22,
+            start_pairs=4,
+            round_pairs=2,
+            rounds=OpenFieldTotalVariation.rounds,
+            images=22,
             settings=(TAU, PRIOR_SLOPE, PRIOR_LOG_POWER),
         ),
     )
-}  # fmt: skip
+}
 DEFAULT = "variation"
 
 

@@ -119,9 +119,11 @@ def projection_of(per_deg: float | None) -> FieldProjection:
 
 
 def place(
-    flats: Sequence[FlatPicture], n: int, progress: Callable[[int], None] = lambda _: None,
+    flats: Sequence[FlatPicture],
+    n: int,
+    progress: Callable[[int], None] = lambda _: None,
     px_per_deg: float | None = None,
-) -> list[Placement]:  # fmt: skip
+) -> list[Placement]:
     """Return the placement of each picture; `n` pixels per sample, `px_per_deg` as in `make_montage`.
 
     Each round places the picture with the best match, and then registers the remaining ones to it as well. So a picture
@@ -263,8 +265,9 @@ def _blended(
     scale = np.maximum(weights, 1e-6)
     blended = total / (scale if first.ndim == 2 else scale[..., None])
     return np.asarray(blended * (weights > 0 if first.ndim == 2 else (weights > 0)[..., None]), np.float32), (
-        int(low[0]), int(low[1]),
-    )  # fmt: skip
+        int(low[0]),
+        int(low[1]),
+    )
 
 
 def _border(shape: tuple[int, ...]) -> Floats:

@@ -25,7 +25,7 @@ from device.recon.assessment.image_quality import (
     psf_match,
     quality_warnings,
 )
-from device.recon.assessment.psf_consistency import Match, PsfConsistency
+from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
 from device.recon.estimation.corrected_refraction import corrected
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.power_law_prior import PowerLaw
@@ -130,9 +130,14 @@ class _Stage:
     """Planned resources of one stage: forward model, preprocessor, solver, output arrays and cost estimates."""
 
     def __init__(
-        self, recipe: Recipe, method: Method, calibration: Calibration, shape: tuple[int, int], planner: Planner,
+        self,
+        recipe: Recipe,
+        method: Method,
+        calibration: Calibration,
+        shape: tuple[int, int],
+        planner: Planner,
         index: int,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.recipe, self.is_closed_form = recipe, method.rounds == 0
         self.model = method.model(calibration, shape, recipe.bin, planner, index)
         self.grid = self.model.grid
@@ -183,11 +188,20 @@ class Reconstructor:
     """
 
     def __init__(
-        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
-        recipes: tuple[Recipe, ...] = (), psf_index: int = 0, refract: bool = True,
-        consistency: PsfConsistency | None = None, timed: bool = True, methods: Mapping[str, Method] = METHODS,
-        audience: Audience = Audience.OPERATOR, field_fixed: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        calibration: Calibration,
+        shape: tuple[int, int],
+        planner: Planner,
+        clock: Clock,
+        recipes: tuple[Recipe, ...] = (),
+        psf_index: int = 0,
+        refract: bool = True,
+        consistency: PsfConsistency | None = None,
+        timed: bool = True,
+        methods: Mapping[str, Method] = METHODS,
+        audience: Audience = Audience.OPERATOR,
+        field_fixed: bool = False,
+    ) -> None:
         recipes = recipes or default_schedule(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
             raise SettingError("a sample is made of at least one pixel")
@@ -229,9 +243,15 @@ class Reconstructor:
             self._refocus(eye)
 
     def __call__(
-        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
-        rounds: int | None = None, quick: bool = False,
-    ) -> Reconstruction:  # fmt: skip
+        self,
+        counts: Pixels,
+        dark: Pixels | None = None,
+        *,
+        simulated: bool = False,
+        deadline: Deadline | None = None,
+        rounds: int | None = None,
+        quick: bool = False,
+    ) -> Reconstruction:
         """Return the best picture that fits into `deadline`, and its report: the last one of `steps`."""
         steps = self.steps(counts, dark, simulated=simulated, deadline=deadline, rounds=rounds, quick=quick)
         (picture,) = deque(steps, maxlen=1)
@@ -239,10 +259,19 @@ class Reconstructor:
         return picture
 
     def steps(
-        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
-        rounds: int | None = None, quick: bool = False, joined: Image | None = None, refract: bool = True,
-        refraction: RefractionTask | None = None, others: Sequence[Pixels] = (),
-    ) -> Iterator[Step]:  # fmt: skip
+        self,
+        counts: Pixels,
+        dark: Pixels | None = None,
+        *,
+        simulated: bool = False,
+        deadline: Deadline | None = None,
+        rounds: int | None = None,
+        quick: bool = False,
+        joined: Image | None = None,
+        refract: bool = True,
+        refraction: RefractionTask | None = None,
+        others: Sequence[Pixels] = (),
+    ) -> Iterator[Step]:
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
         The picture is linear float32, (rows, cols) or (rows, cols, 3) of the sensor; `counts` and `dark` are uint16 or
@@ -356,35 +385,57 @@ class Reconstructor:
         recipe, diagnostics, frame = run.done.recipe, run.solved.diagnostics, run.solved.frame
         dark = not frame.mean_dn > 0 or diagnostics.noise_dn == 0
         quality: dict[str, float | None] = {
-            "saturated": frame.saturated, "missing": frame.missing, "mean_dn": frame.mean_dn, **diagnostics.quality,
-        }  # fmt: skip
+            "saturated": frame.saturated,
+            "missing": frame.missing,
+            "mean_dn": frame.mean_dn,
+            **diagnostics.quality,
+        }
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
-        match, eye = psf_match(quality), run.refraction
         psf_scale = 1.0 if self.refractor is None or run.eye is None else self.refractor.scale(run.eye.m_dpt)
+        match = psf_match(quality)
         if self._consistency is not None and not dark:
-            figures = self._consistency(run.counts, psf_scale, run.known_defects)
-            quality |= {} if figures is None else figures.report_figures
-            match = Match.UNKNOWN if figures is None else figures.match
+            match = self._checked_match(self._consistency(run.counts, psf_scale, run.known_defects), quality)
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience)
         explained = not dark and is_explained(quality, match, misfit)
-        if eye is not None and not (explained and is_lit(quality)):
-            eye = NoRefraction("the forward model does not explain the frame")
-        if isinstance(eye, Refraction):
-            eye = corrected(eye, self.calibration.refraction_offset)
+        eye = self._reported_refraction(run.refraction, explained and is_lit(quality))
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }
         if isinstance(eye, Refraction) and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         return Report(
-            method=recipe.method, bin=recipe.bin, rounds=run.rounds_done, stopped=run.stopped, seconds=seconds,
-            psf_index=self.psf_index, psf_scale=psf_scale, psf_cylinder=self._psf_cylinder(run),
-            refraction_dpt=None if eye is None else report_of(eye), refraction_scatter=scatter_of(eye),
+            method=recipe.method,
+            bin=recipe.bin,
+            rounds=run.rounds_done,
+            stopped=run.stopped,
+            seconds=seconds,
+            psf_index=self.psf_index,
+            psf_scale=psf_scale,
+            psf_cylinder=self._psf_cylinder(run),
+            refraction_dpt=None if eye is None else report_of(eye),
+            refraction_scatter=scatter_of(eye),
             regularisation=dict(diagnostics.regularisation),
             noise_dn=None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin,
             residual=diagnostics.residual,
-            quality=quality, warnings=warnings,
-        )  # fmt: skip
+            quality=quality,
+            warnings=warnings,
+        )
+
+    @staticmethod
+    def _checked_match(figures: Consistency | None, quality: dict[str, float | None]) -> Match:
+        """Return whether frame and PSF match, and add the figures of the consistency check to `quality`."""
+        if figures is None:
+            return Match.UNKNOWN
+        quality |= figures.report_figures
+        return figures.match
+
+    def _reported_refraction(
+        self, eye: Refraction | NoRefraction | None, explained: bool
+    ) -> Refraction | NoRefraction | None:
+        """Return the refraction that the report states: corrected, or refused for a frame that is not explained."""
+        if eye is not None and not explained:
+            return NoRefraction("the forward model does not explain the frame")
+        return corrected(eye, self.calibration.refraction_offset) if isinstance(eye, Refraction) else eye
 
     def _psf_cylinder(self, run: "_Run") -> dict[str, float | None] | None:
         """Return `psf_cylinder` of the report: the cylinder of the picture's PSF, and its gain if it is predicted."""

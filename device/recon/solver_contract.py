@@ -62,13 +62,15 @@ def check_method(method: Method) -> None:
         level_dn = _level_dn(planned.model, first)
         _require(
             abs(level_dn / LEVEL_DN - 1) < SCALE_ERROR,
-            f"the picture is in linear DN: an object of {LEVEL_DN:g} DN became {level_dn:.4g} DN", method,
-        )  # fmt: skip
+            f"the picture is in linear DN: an object of {LEVEL_DN:g} DN became {level_dn:.4g} DN",
+            method,
+        )
         half_dn = _level_dn(planned.model, planned.solve(0.5))
         _require(
             abs(half_dn / level_dn - 0.5) < SCALE_ERROR / 2,
-            f"half the light gives half the picture, not {half_dn / level_dn:.3f} of it", method,
-        )  # fmt: skip
+            f"half the light gives half the picture, not {half_dn / level_dn:.3f} of it",
+            method,
+        )
         _require(bool(np.isfinite(planned.solve(0.0)).all()), "a frame without light gives a finite picture", method)
         again = float(np.abs(planned.solve() - first).max()) / LEVEL_DN
         _require(again < REPEAT_ERROR, f"a frame gives the same picture again; it changed by {again:.2g}", method)

@@ -27,9 +27,12 @@ def screen(world: World, e_per_s: float) -> Image:
 
 
 def point(
-    world: World, e_per_s: float, moved_px: tuple[int, int] = (0, 0), moved_mm: float = 0.0,
+    world: World,
+    e_per_s: float,
+    moved_px: tuple[int, int] = (0, 0),
+    moved_mm: float = 0.0,
     colour: Colour | None = None,
-) -> Image:  # fmt: skip
+) -> Image:
     """Return the image of the calibration's point source, brightest pixel `e_per_s` before the pixels' response.
 
     The image is centred, then shifted by `moved_px` (down, right). `moved_mm` moves the source along the axis, away

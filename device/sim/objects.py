@@ -40,9 +40,14 @@ TOLERANCE_DEG = 0.05  # tolerance for an object that ends on the field's edge
 
 
 def draw_object(
-    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float,
-    turn_deg: Pair = (0.0, 0.0), lit_deg: float | None = None,
-) -> Fundus:  # fmt: skip
+    scene: SimSpec,
+    optics: OpticsSpec,
+    eye: Eye,
+    shape: tuple[int, int],
+    px_per_deg: float,
+    turn_deg: Pair = (0.0, 0.0),
+    lit_deg: float | None = None,
+) -> Fundus:
     """Return the object of a scene in the middle of `shape` (rows, cols): reflectances in 0..1, zero outside the light.
 
     `lit_deg` is the full angle to which light arrives, at least that of the field; None: the field has a sharp edge.
@@ -90,9 +95,14 @@ def height_um(angle_off_deg: float, focal_length_um: float) -> float:
 
 
 def _moved_picture(
-    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, gaze_deg: Pair,
+    scene: SimSpec,
+    optics: OpticsSpec,
+    eye: Eye,
+    shape: tuple[int, int],
+    px_per_deg: float,
+    gaze_deg: Pair,
     lit_deg: float,
-) -> Fundus:  # fmt: skip
+) -> Fundus:
     """Return a retina or photograph, shifted and turned (right, down), cropped by the light, which stays centred."""
     what, is_retina = scene.object, scene.object.kind == "retina"
     more_deg = (lit_deg - optics.field_deg) / 2
@@ -161,10 +171,17 @@ def _picture(
     if what.image is not None:
         return photograph(what.image, shape, px_per_deg, wide_deg, None if what.cut_deg is None else what.cut_deg[0])
     return fundus(
-        shape, px_per_deg, wide_deg, scene.seed % 2**32, eye=eye, haemorrhages=what.haemorrhages,
-        microaneurysms=what.microaneurysms, exudates=what.exudates,
-        beyond_deg=beyond_deg, pigments=Pigments(what.melanin, what.macular_pigment, what.haemoglobin),
-    )  # fmt: skip
+        shape,
+        px_per_deg,
+        wide_deg,
+        scene.seed % 2**32,
+        eye=eye,
+        haemorrhages=what.haemorrhages,
+        microaneurysms=what.microaneurysms,
+        exudates=what.exudates,
+        beyond_deg=beyond_deg,
+        pigments=Pigments(what.melanin, what.macular_pigment, what.haemoglobin),
+    )
 
 
 def _crop_to_field(

@@ -86,9 +86,14 @@ def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
 
 @lru_cache(maxsize=4)
 def cached_caustic(
-    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None,
+    optics: OpticsSpec,
+    pitch_um: float,
+    seed: int,
+    refraction: Refraction,
+    lines: int,
+    beam: Beam | None,
     element: DiffuserSpec = RANDOM_SURFACE,
-) -> Image:  # fmt: skip
+) -> Image:
     """Return the PSF of `caustic` as a read-only array, from a cache of the last four sets of arguments."""
     point = caustic(optics, pitch_um, seed, refraction, lines, beam, element)
     point.flags.writeable = False

@@ -72,9 +72,17 @@ def recorded_head(recording: ReplaySpec, name: str) -> InstrumentSpec:
     if max(rows, cols) > MAX_SIDE_PX:
         raise SpecError(f"{recording.raws[0]} has {rows} x {cols} pixels; no more than {MAX_SIDE_PX} fit on a side")
     camera = CameraSpec(
-        backend="replay", rows=rows, cols=cols, pitch_um=1.0, bit_depth=16, black_dn=recording.black_dn,
-        full_well_e=65535, read_noise_e=0, exposure_s=0.02, preview_exposure_s=0.02,
-    )  # fmt: skip
+        backend="replay",
+        rows=rows,
+        cols=cols,
+        pitch_um=1.0,
+        bit_depth=16,
+        black_dn=recording.black_dn,
+        full_well_e=65535,
+        read_noise_e=0,
+        exposure_s=0.02,
+        preview_exposure_s=0.02,
+    )
     return InstrumentSpec(name=name, camera=camera, light=LightSpec(backend="replay"), replay=recording)
 
 
@@ -203,6 +211,10 @@ def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibrat
         flat = flat.mean(axis=2) if flat.ndim == 3 else flat
     geometry = spec.optics.geometry(spec.camera.pitch_um) if spec.optics else None
     return Calibration(
-        psfs=psfs, sensor=Sensor(black_dn=camera.black_dn, white_dn=camera.white_dn), geometry=geometry,
-        field_deg=picture_field_deg(spec), flat=flat, bad=camera.bad,
-    )  # fmt: skip
+        psfs=psfs,
+        sensor=Sensor(black_dn=camera.black_dn, white_dn=camera.white_dn),
+        geometry=geometry,
+        field_deg=picture_field_deg(spec),
+        flat=flat,
+        bad=camera.bad,
+    )

@@ -106,11 +106,13 @@ def plan_as_json(plan: tuple[Decision, ...], spent_ms: dict[str, float]) -> dict
     """Return by effect name: simulated or not, eta, the text that explains eta, and the computing time in ms."""
     return {
         one.name: {
-            "simulated": one.simulated, "eta": one.eta, "why": one.why,
+            "simulated": one.simulated,
+            "eta": one.eta,
+            "why": one.why,
             "cost_ms": round(spent_ms.get(one.name, 0.0), 1) if one.simulated else 0.0,
         }
         for one in plan
-    }  # fmt: skip
+    }
 
 
 def _write_vessels(world: World, path: Path) -> None:

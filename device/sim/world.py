@@ -19,10 +19,18 @@ from device.sim.sensor import SensorModel
 from device.values import BatteryState, Colour, Eye, Geometry, HeadIdentity, Illumination, Image
 
 REFERENCE_C = 25.0  # temperature at which the dark current is that of the scene file
-FAULTS = frozenset({
-    "camera.missing", "camera.stalled", "camera.mode", "light.fault", "light.silent", "bus.silent", "eye.closed",
-    "eye.other",
-})  # fmt: skip
+FAULTS = frozenset(
+    {
+        "camera.missing",
+        "camera.stalled",
+        "camera.mode",
+        "light.fault",
+        "light.silent",
+        "bus.silent",
+        "eye.closed",
+        "eye.other",
+    }
+)
 
 FELLOW_EYE: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
 

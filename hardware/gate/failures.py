@@ -82,8 +82,10 @@ class _State:
 
     def _joined(self) -> dict[str, str]:
         """Return the net to which each named net belongs now: short circuits give it another name."""
-        header = {name: self._nets.nets["J1", pin] for pin, name in
-                  (("1", LOGIC), ("2", SUPPLY), ("6", GROUND), ("11", HEARTBEAT))}  # fmt: skip
+        header = {
+            name: self._nets.nets["J1", pin]
+            for pin, name in (("1", LOGIC), ("2", SUPPLY), ("6", GROUND), ("11", HEARTBEAT))
+        }
         return {name: net for name, net in header.items() if net is not None}
 
     @property

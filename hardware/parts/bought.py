@@ -102,8 +102,14 @@ def retina_chart(d: Dimensions) -> Part:
 
 
 HEAD: dict[str, Callable[[Dimensions], Part]] = {
-    "lens tubes": lens_tube, "beam splitter": beam_splitter, "LED matrix": led_matrix, "LED film": led_film,
-    "polariser film": polariser_film, "lever": lever, "diffuser": diffuser, "camera": camera,
-}  # fmt: skip
+    "lens tubes": lens_tube,
+    "beam splitter": beam_splitter,
+    "LED matrix": led_matrix,
+    "LED film": led_film,
+    "polariser film": polariser_film,
+    "lever": lever,
+    "diffuser": diffuser,
+    "camera": camera,
+}
 EYE: dict[str, Callable[[Dimensions], Part]] = {"eye lens": eye_lens, "pinhole": pinhole}
 CHART: dict[str, Callable[[Dimensions], Part]] = {"eye lens": eye_lens, "retina chart": retina_chart}

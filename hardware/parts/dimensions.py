@@ -113,8 +113,10 @@ class Dimensions:
     @property
     def _layout(self) -> LayoutSpec:
         if self.path.layout is None:
-            raise SpecError("the light path has no table [layout], which says how thick the beam splitter is",
-                            "Copy [layout] from hardware/optics.toml, with the thickness of your plate.")  # fmt: skip
+            raise SpecError(
+                "the light path has no table [layout], which says how thick the beam splitter is",
+                "Copy [layout] from hardware/optics.toml, with the thickness of your plate.",
+            )
         return self.path.layout
 
     @property

@@ -21,39 +21,90 @@ from services.lab.plot import line, text
 BESIDE = {"LED cap", "LED cover", "LED matrix"}  # cut where LEDs of the ring are
 UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards
 BOUGHT = {
-    "lens tubes": "metal", "beam splitter": "glass", "LED matrix": "board", "LED film": "glass", "lever": "metal",
-    "polariser film": "glass", "diffuser": "glass", "camera": "board", "eye lens": "glass", "pinhole": "metal",
+    "lens tubes": "metal",
+    "beam splitter": "glass",
+    "LED matrix": "board",
+    "LED film": "glass",
+    "lever": "metal",
+    "polariser film": "glass",
+    "diffuser": "glass",
+    "camera": "board",
+    "eye lens": "glass",
+    "pinhole": "metal",
     "retina chart": "glass",
-}  # fmt: skip
+}
 AWAY: dict[str, Offset] = {  # how far each part is drawn from its place
-    "lens tubes": (0, 0, -60), "tube flange": (0, 0, -38), "plate lid": (-58, 0, 0), "beam splitter": (-34, 0, 0),
-    "LED film": (0, 14, 0), "LED cap": (0, 34, 0), "LED matrix": (0, 54, 0), "LED cover": (0, 72, 0),
-    "polariser ring": (0, 0, 26), "polariser film": (0, 0, 36), "diffuser cell": (0, 0, 56), "lever": (0, 22, 56),
-    "iris": (0, 0, 66), "diffuser": (0, 0, 74), "retaining ring": (0, 0, 84), "sensor spacer": (0, 0, 96),
-    "camera": (0, 0, 112), "camera cover": (0, 0, 128),
-}  # fmt: skip
+    "lens tubes": (0, 0, -60),
+    "tube flange": (0, 0, -38),
+    "plate lid": (-58, 0, 0),
+    "beam splitter": (-34, 0, 0),
+    "LED film": (0, 14, 0),
+    "LED cap": (0, 34, 0),
+    "LED matrix": (0, 54, 0),
+    "LED cover": (0, 72, 0),
+    "polariser ring": (0, 0, 26),
+    "polariser film": (0, 0, 36),
+    "diffuser cell": (0, 0, 56),
+    "lever": (0, 22, 56),
+    "iris": (0, 0, 66),
+    "diffuser": (0, 0, 74),
+    "retaining ring": (0, 0, 84),
+    "sensor spacer": (0, 0, 96),
+    "camera": (0, 0, 112),
+    "camera cover": (0, 0, 128),
+}
 EYE_AWAY: dict[str, Offset] = {
     "eye collar": (0, 0, 30),
-    "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "pinhole": (0, 0, -60), "pinhole piston": (0, 0, -70),
-}  # fmt: skip
+    "eye lens": (0, 0, -62),
+    "step ring": (0, 0, -30),
+    "pinhole": (0, 0, -60),
+    "pinhole piston": (0, 0, -70),
+}
 CHART_AWAY: dict[str, Offset] = {
     "eye collar": (0, 0, 30),
-    "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "retina chart": (0, 0, -56), "chart piston": (0, 0, -70),
-}  # fmt: skip
+    "eye lens": (0, 0, -62),
+    "step ring": (0, 0, -30),
+    "retina chart": (0, 0, -56),
+    "chart piston": (0, 0, -70),
+}
 OBLIQUE = View((-0.60, 0.52, 0.24))
 FROM_FRONT = View((-0.60, 0.45, -0.45))
 STEPS: dict[str, tuple[int, View, dict[str, Offset]]] = {  # a step of the guide: its number, what joins what
-    "iris": (2, OBLIQUE, {"diffuser cell": (0, 0, 0), "iris": (0, 0, 22), "diffuser": (0, 0, 34),
-                       "retaining ring": (0, 0, 48)}),
-    "sensor": (3, OBLIQUE, {"diffuser cell": (0, 0, 0), "sensor spacer": (0, 0, 22), "camera": (0, 0, 44),
-                         "camera cover": (0, 0, 66)}),
+    "iris": (
+        2,
+        OBLIQUE,
+        {"diffuser cell": (0, 0, 0), "iris": (0, 0, 22), "diffuser": (0, 0, 34), "retaining ring": (0, 0, 48)},
+    ),
+    "sensor": (
+        3,
+        OBLIQUE,
+        {"diffuser cell": (0, 0, 0), "sensor spacer": (0, 0, 22), "camera": (0, 0, 44), "camera cover": (0, 0, 66)},
+    ),
     "splitter": (4, OBLIQUE, {"splitter block": (0, 0, 0), "beam splitter": (-48, 0, 0), "plate lid": (-78, 0, 0)}),
-    "polariser": (5, FROM_FRONT, {"diffuser cell": (0, 0, 0), "polariser film": (0, 0, -20),
-                                  "polariser ring": (0, 0, -34), "lever": (0, 16, 0), "splitter block": (0, 0, -62)}),
-    "ring": (7, OBLIQUE, {"splitter block": (0, 0, 0), "LED film": (0, 14, 0), "LED cap": (0, 34, 0),
-                       "LED matrix": (0, 54, 0), "LED cover": (0, 72, 0)}),
+    "polariser": (
+        5,
+        FROM_FRONT,
+        {
+            "diffuser cell": (0, 0, 0),
+            "polariser film": (0, 0, -20),
+            "polariser ring": (0, 0, -34),
+            "lever": (0, 16, 0),
+            "splitter block": (0, 0, -62),
+        },
+    ),
+    "ring": (
+        7,
+        OBLIQUE,
+        {
+            "splitter block": (0, 0, 0),
+            "LED film": (0, 14, 0),
+            "LED cap": (0, 34, 0),
+            "LED matrix": (0, 54, 0),
+            "LED cover": (0, 72, 0),
+        },
+    ),
     "tubes": (8, FROM_FRONT, {"splitter block": (0, 0, 0), "tube flange": (0, 0, -34), "lens tubes": (0, 0, -66)}),
-}  # fmt: skip
+}
 
 
 def pictures(d: Dimensions, folder: Path) -> list[Path]:
@@ -115,8 +166,13 @@ def relay(d: Dimensions) -> str:
 
 def _lens(faces: Sequence[Surface], half_mm: float) -> Drawn:
     """One cemented doublet: outlines of its two glasses between three faces."""
-    curves = [[(face.at_mm + face.radius_mm - copysign(sqrt(face.radius_mm**2 - y**2), face.radius_mm), y)
-               for y in (half_mm * k / 24 for k in range(-24, 25))] for face in faces]  # fmt: skip
+    curves = [
+        [
+            (face.at_mm + face.radius_mm - copysign(sqrt(face.radius_mm**2 - y**2), face.radius_mm), y)
+            for y in (half_mm * k / 24 for k in range(-24, 25))
+        ]
+        for face in faces
+    ]
     outlines = [_outline([*left, *reversed(right)]) for left, right in pairwise(curves)]
     ends = [z for curve in curves for z, _ in curve]
     svg = "".join(f'<path class="glass" d="{outline}"/>' for outline in outlines)
@@ -218,6 +274,11 @@ def _kind(name: str) -> str:
 
 
 PICTURES: dict[str, Callable[[Dimensions], str]] = {
-    "exploded": exploded, "section": section, "eye": eye, "chart-eye": chart_eye, "printed": printed,
-    "step-relay": relay, **{f"step-{name}": partial(step, name) for name in STEPS},
-}  # fmt: skip
+    "exploded": exploded,
+    "section": section,
+    "eye": eye,
+    "chart-eye": chart_eye,
+    "printed": printed,
+    "step-relay": relay,
+    **{f"step-{name}": partial(step, name) for name in STEPS},
+}

@@ -113,9 +113,7 @@ class BackupFolder:
         lines = self._index.read_text("ascii", "replace").splitlines() if self._index.exists() else []
         lengths = {path.stem: path.stat().st_size for path in files_in(self._objects, "*.age")}
         found = [match.groups() for line in lines if (match := _LINE.fullmatch(line))]
-        return {
-            name: (sha256, int(length)) for name, sha256, length in found if lengths.get(sha256) == int(length)
-        }  # fmt: skip
+        return {name: (sha256, int(length)) for name, sha256, length in found if lengths.get(sha256) == int(length)}
 
 
 def backup_numbers(folder: Path) -> list[int]:

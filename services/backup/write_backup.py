@@ -93,9 +93,13 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     target.add_backup(number, encrypted)
     progress(len(paths), len(paths))
     return LastBackup(
-        number=number, made_at=made_at, folder=str(target.folder), units=len(objects),
-        written_bytes=written_bytes + len(encrypted), unreadable=tuple(unreadable),
-    )  # fmt: skip
+        number=number,
+        made_at=made_at,
+        folder=str(target.folder),
+        units=len(objects),
+        written_bytes=written_bytes + len(encrypted),
+        unreadable=tuple(unreadable),
+    )
 
 
 def _object_of(store: Path, unit: str, target: BackupFolder, key: BackupKey) -> tuple[str, int]:

@@ -171,9 +171,11 @@ class HttpsUploader:
     def _put(self, archive: VisitArchive, pause: Callable[[], None]) -> None:
         digest = base64.b64encode(bytes.fromhex(archive.sha256)).decode()
         headers = self._auth_headers() | {
-            "If-None-Match": "*", "Content-Type": "application/zip", "Content-Length": str(len(archive.content)),
+            "If-None-Match": "*",
+            "Content-Type": "application/zip",
+            "Content-Length": str(len(archive.content)),
             "Repr-Digest": f"sha-256=:{digest}:",
-        }  # fmt: skip
+        }
         with self._connected() as connection:
             connection.putrequest("PUT", self._path(archive))
             for name, value in headers.items():

@@ -14,9 +14,19 @@ from services.records.laterality_correction import LateralityQuestion
 from services.records.upload_queue import QueueStatus
 
 AlertCode = Literal[
-    "store.full", "store.low", "heat.hot", "heat.warm", "batt.empty", "batt.low", "cal.old", "clock.wrong", "make.slow",
-    "eye.side", "send.stuck", "send.waiting",
-]  # fmt: skip
+    "store.full",
+    "store.low",
+    "heat.hot",
+    "heat.warm",
+    "batt.empty",
+    "batt.low",
+    "cal.old",
+    "clock.wrong",
+    "make.slow",
+    "eye.side",
+    "send.stuck",
+    "send.waiting",
+]
 
 
 @dataclass(frozen=True)

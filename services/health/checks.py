@@ -215,9 +215,11 @@ def clock(facts: StatusSnapshot) -> Check:
 
 
 CLOCK_WORDS: dict[ClockState, str] = {
-    "network": "set by the network", "rtc": "kept by the clock of the board", "browser": "set by a tablet",
+    "network": "set by the network",
+    "rtc": "kept by the clock of the board",
+    "browser": "set by a tablet",
     "not_set": "time not set",
-}  # fmt: skip
+}
 
 
 def speed(facts: StatusSnapshot) -> Check:
@@ -317,9 +319,22 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
-    camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
-    light_limits, settings, power,
-)  # fmt: skip
+    camera,
+    lamp,
+    calibration,
+    captures,
+    database,
+    space,
+    battery,
+    heat,
+    clock,
+    speed,
+    sending,
+    backup,
+    light_limits,
+    settings,
+    power,
+)
 
 
 def run_checks(facts: StatusSnapshot) -> list[Check]:

@@ -82,9 +82,11 @@ def computer(machine: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFi
         return
     needed = spec is None or spec.camera.backend == "picamera2" or bool(_nodes(spec))
     yield DoctorFinding(
-        check="computer", state="warning" if needed else "ok", reading=model or "no Raspberry Pi",
+        check="computer",
+        state="warning" if needed else "ok",
+        reading=model or "no Raspberry Pi",
         remedy="Run the doctor on the Raspberry Pi to which the head is connected." if needed else "",
-    )  # fmt: skip
+    )
 
 
 def libraries(_: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFinding]:
@@ -92,9 +94,11 @@ def libraries(_: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFinding
     for name, package in _libraries(spec):
         there = find_spec(name) is not None
         yield DoctorFinding(
-            check=f"library {name}", state="ok" if there else "failed", reading="found" if there else "not found",
+            check=f"library {name}",
+            state="ok" if there else "failed",
+            reading="found" if there else "not found",
             remedy="" if there else f"Install it: sudo apt install {package}, then make pi, so that .venv sees it.",
-        )  # fmt: skip
+        )
 
 
 def buses(machine: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFinding]:
@@ -120,14 +124,18 @@ def gate(machine: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFindin
         return
     if spec.gpio is None or spec.gpio.heartbeat is None:
         yield DoctorFinding(
-            check="gate", state="warning", reading="the head file names no heartbeat: not for eyes",
+            check="gate",
+            state="warning",
+            reading="the head file names no heartbeat: not for eyes",
             remedy="Build the gate (hardware/dead-man.md), then add [gpio] to the head file.",
-        )  # fmt: skip
+        )
     elif not machine.is_set(STRICT_GPIO):
         yield DoctorFinding(
-            check="gate", state="warning", reading=f"{STRICT_GPIO} is not set: a line keeps its level after a crash",
+            check="gate",
+            state="warning",
+            reading=f"{STRICT_GPIO} is not set: a line keeps its level after a crash",
             remedy=f"Add the line {STRICT_GPIO} to /boot/firmware/config.txt, and restart the computer.",
-        )  # fmt: skip
+        )
     else:
         yield DoctorFinding(check="gate", state="ok", reading=f"heartbeat on GPIO{spec.gpio.heartbeat}")
 

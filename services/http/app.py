@@ -59,11 +59,16 @@ class Application:
 
 
 def create_app(
-    arbiter: HeadArbiter, authenticator: PinAuthenticator, protocol: Protocol | None = None,
-    host_names: tuple[str, ...] | None = None, usb_drives: UsbDrives | None = None,
-    technician_routers: Sequence[APIRouter] = (), uploader: Uploader | None = None,
-    stream_limits: ClientLimits = STREAM_LIMITS, preview_limits: ClientLimits = PREVIEW_LIMITS,
-) -> Application:  # fmt: skip
+    arbiter: HeadArbiter,
+    authenticator: PinAuthenticator,
+    protocol: Protocol | None = None,
+    host_names: tuple[str, ...] | None = None,
+    usb_drives: UsbDrives | None = None,
+    technician_routers: Sequence[APIRouter] = (),
+    uploader: Uploader | None = None,
+    stream_limits: ClientLimits = STREAM_LIMITS,
+    preview_limits: ClientLimits = PREVIEW_LIMITS,
+) -> Application:
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
     `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
@@ -114,10 +119,14 @@ Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAPI:
     """Return a FastAPI application with problem responses and the security middlewares, the last one outermost."""
     app = DocumentedApp(
-        title="Diffuscope", version=version("diffuscope"), lifespan=lifespan,
-        openapi_url="/api/openapi.json", docs_url=None, redoc_url=None,
+        title="Diffuscope",
+        version=version("diffuscope"),
+        lifespan=lifespan,
+        openapi_url="/api/openapi.json",
+        docs_url=None,
+        redoc_url=None,
         responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
-    )  # fmt: skip
+    )
     register_error_handlers(app)
     app.add_middleware(HeadRequests)
     app.add_middleware(CrossOriginProtection, names=host_names, answer=problem_response)

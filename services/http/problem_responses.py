@@ -118,9 +118,7 @@ def problem_response(error: DiffuscopeError) -> Response:
 
 def problem_body(error: DiffuscopeError) -> ProblemResponse:
     """Return the problem response body of an error."""
-    return ProblemResponse(
-        code=error.code, message=error.message, remedy=error.remedy, n=error.n, wait_s=error.wait_s
-    )  # fmt: skip
+    return ProblemResponse(code=error.code, message=error.message, remedy=error.remedy, n=error.n, wait_s=error.wait_s)
 
 
 def error_text(error: DiffuscopeError | None) -> ErrorText | None:

@@ -103,10 +103,17 @@ def _remedy(error: OSError, port: int) -> str:
 
 
 def serve(
-    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog,
-    protocol: Protocol, measure: Measure, host_names: tuple[str, ...] = (),
-    updater: tuple[Path | None, Path | None] = (None, None), uploader: Uploader | None = None,
-) -> None:  # fmt: skip
+    spec: InstrumentSpec,
+    address: socket.socket,
+    data: Path,
+    ready: Callable[[], None],
+    watchdog: Watchdog,
+    protocol: Protocol,
+    measure: Measure,
+    host_names: tuple[str, ...] = (),
+    updater: tuple[Path | None, Path | None] = (None, None),
+    uploader: Uploader | None = None,
+) -> None:
     """Open the store and the head, call `ready`, and serve at `address` until SIGTERM, SIGINT or a failure.
 
     The page is available while the exam still plans its FFTs; an error that stopped the server is raised at the end.
@@ -171,9 +178,16 @@ def _open_exam(
     pictures = VisitRepository(context.store.engine, protocol, context.clock).pictures
     head = open_head(with_calibration(context.spec, context.archive.root), context.clock, doses)
     return ExamService(
-        head, context.store, context.event_bus, context.clock, plans, context.on_failure, context.watchdog,
-        lambda: explorer.budget_s, pictures.resumed_target,
-    )  # fmt: skip
+        head,
+        context.store,
+        context.event_bus,
+        context.clock,
+        plans,
+        context.on_failure,
+        context.watchdog,
+        lambda: explorer.budget_s,
+        pictures.resumed_target,
+    )
 
 
 class _Stop:

@@ -17,9 +17,12 @@ from services import resources
 from services.http.bundler import bundle_module, bundle_style_sheet
 
 MEDIA_TYPES = {
-    ".css": "text/css", ".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript",
+    ".css": "text/css",
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".mjs": "text/javascript",
     ".svg": "image/svg+xml",
-}  # fmt: skip
+}
 PAGES = {
     "index.html": ("app.js", "styles/app.css"),
     "technician.html": ("technician/technician.js", "styles/technician_app.css"),

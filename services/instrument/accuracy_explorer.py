@@ -73,9 +73,15 @@ class AccuracyExplorer:
     """
 
     def __init__(
-        self, folder: Path, plans: Path, clock: Clock, spec: InstrumentSpec, publish: Callable[..., None],
-        measure: Measure, scene: Path = SCENE,
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        plans: Path,
+        clock: Clock,
+        spec: InstrumentSpec,
+        publish: Callable[..., None],
+        measure: Measure,
+        scene: Path = SCENE,
+    ) -> None:
         self.folder, self.plans, self.clock, self.publish = folder, plans, clock, publish
         self._measure_frontier = measure
         self._scene = simulated_head(spec, load_head(scene))

@@ -47,9 +47,14 @@ class CalibrationMonitor:
     """
 
     def __init__(
-        self, head: Head, store: CaptureStore, event_bus: EventBus, clock: Clock, is_pressed: Callable[[], bool],
+        self,
+        head: Head,
+        store: CaptureStore,
+        event_bus: EventBus,
+        clock: Clock,
+        is_pressed: Callable[[], bool],
         watchdog: Watchdog,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._head, self._store, self._event_bus, self._clock = head, store, event_bus, clock
         self._is_pressed, self._watchdog = is_pressed, watchdog
         self._witness: PsfMatchTest | None = None

@@ -179,9 +179,7 @@ def _frame_files(capture: Capture, head: str, shot: ExposedCapture) -> dict[str,
     frames |= {colour_name(colour): one for colour, one in shot.colours.items()}
     frames |= {} if shot.dark is None else {DARK: shot.dark}
     written = shot.written()
-    shared = RawMetadata(
-        capture.id, capture.eye, capture.taken_at, calibration_id=capture.calibration_id, head=head
-    )  # fmt: skip
+    shared = RawMetadata(capture.id, capture.eye, capture.taken_at, calibration_id=capture.calibration_id, head=head)
 
     def content(frame: Frame) -> FileContent:
         if (file := written.get(frame.number)) is not None:
@@ -201,11 +199,13 @@ def capture_report(
     """
     report = CaptureReport(
         replace(made, seconds={"expose": shot.expose_s, **made.seconds}, warnings=(*made.warnings, *shot.notes)),
-        shot.light, shot.press.target.visit, shot.press.target.slot,
+        shot.light,
+        shot.press.target.visit,
+        shot.press.target.slot,
         PictureVerdict(verdict.word, verdict.code, verdict.numbers),
         None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),
         budget_s,
-    )  # fmt: skip
+    )
     return read_report(json.loads(as_json(report_as_json(report))))
 
 

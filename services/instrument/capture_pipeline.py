@@ -79,9 +79,14 @@ class FrameReconstructor(Protocol):
         """Yield the result of each stage, ROUND_DONE after each round of the last one, and the picture."""
 
     def __call__(
-        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
+        self,
+        counts: Pixels,
+        dark: Pixels | None = None,
+        *,
+        simulated: bool = False,
+        deadline: Deadline | None = None,
         quick: bool = False,
-    ) -> Reconstruction:  # fmt: skip
+    ) -> Reconstruction:
         """Return the picture of all stages, or with `quick` of the first one."""
 
 
@@ -92,10 +97,15 @@ class FramesReconstructor(Protocol):
         """Return a frame with its quick look, ready for `steps`; `refract`: see there. FrameError for a useless one."""
 
     def steps(
-        self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,
-        deadline: Deadline | None = None, unusable: Mapping[int, str] | None = None,
+        self,
+        frames: Sequence[Pixels],
+        dark: Pixels | None = None,
+        *,
+        simulated: bool,
+        deadline: Deadline | None = None,
+        unusable: Mapping[int, str] | None = None,
         prepared: Mapping[int, PreparedFrame] | None = None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         """Yield the quick look of the first frame, a pause after each frame and round, and the picture."""
 
 
@@ -107,10 +117,16 @@ class ColoursReconstructor(Protocol):
         """Colours that can be reconstructed."""
 
     def steps(
-        self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
-        deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+        self,
+        green: Iterator[Step],
+        frames: Mapping[Colour, Pixels],
+        dark: Pixels | None = None,
+        *,
+        simulated: bool,
+        deadline: Deadline | None = None,
+        missing: Mapping[Colour, str] | None = None,
         lights_dn_per_s: Mapping[Colour, float] | None = None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         """Yield the steps of `green`, ROUND_DONE after each round of other colours, and the picture with colours."""
 
 
@@ -196,19 +212,32 @@ class CapturePipeline:
     """
 
     def __init__(
-        self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
-        feedback: FrameFeedback, bursts: FramesReconstructor | None = None,
-        colours: ColoursReconstructor | None = None, origin: Callable[[], RecordOrigin | None] = lambda: None,
-    ) -> None:  # fmt: skip
+        self,
+        head: Head,
+        clock: Clock,
+        reconstructor: FrameReconstructor,
+        live: FrameReconstructor,
+        feedback: FrameFeedback,
+        bursts: FramesReconstructor | None = None,
+        colours: ColoursReconstructor | None = None,
+        origin: Callable[[], RecordOrigin | None] = lambda: None,
+    ) -> None:
         self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
         self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
         self._known: PressLight | None = None  # of the last good press
 
     def expose(
-        self, eye: Eye, *, in_visit: bool = False, count: int = 1, split: ExposureSplit = WHOLE,
-        colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
+        self,
+        eye: Eye,
+        *,
+        in_visit: bool = False,
+        count: int = 1,
+        split: ExposureSplit = WHOLE,
+        colours: Sequence[Colour] = (),
+        field: str | None = None,
+        taken: Taken = ignore_frame,
         looked: Looked = ignore_look,
-    ) -> Exposure:  # fmt: skip
+    ) -> Exposure:
         """Return a dark frame, up to `count` lit ones and one in each of `colours`, as the function `expose`.
 
         A pipeline of bursts prepares each lit frame while the next one is exposed, and splits the exposures as `split`
@@ -218,9 +247,16 @@ class CapturePipeline:
         unable = self._unable(colours)
         able = [] if self.colours is None else [colour for colour in colours if colour not in unable]
         run = partial(
-            expose, self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field,
+            expose,
+            self._head,
+            (eye,),
+            self._clock,
+            in_visit=in_visit,
+            count=count,
+            colours=able,
+            field=field,
             split=split,
-        )  # fmt: skip
+        )
         if self.bursts is None:
             exposure = run(taken=taken)
         else:
@@ -321,9 +357,14 @@ class CapturePipeline:
             dark_s = shot.dark.exposure_s
             dark = dark if all(dark_fits(one.exposure_s, dark_s) for one in shot.colours.values()) else None
         return self.colours.steps(
-            green, colours, dark, simulated=simulated, deadline=deadline, missing=shot.missing,
+            green,
+            colours,
+            dark,
+            simulated=simulated,
+            deadline=deadline,
+            missing=shot.missing,
             lights_dn_per_s=_lights_dn_per_s(shot, self._head.calibration, dark),
-        )  # fmt: skip
+        )
 
     def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
         """Return the final verdict, from the first one, the report and the number of tries of the slot."""
@@ -411,10 +452,17 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 
 def expose(
-    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
-    colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
+    head: Head,
+    eyes: tuple[Eye, ...],
+    clock: Clock,
+    *,
+    in_visit: bool = False,
+    count: int = 1,
+    colours: Sequence[Colour] = (),
+    field: str | None = None,
+    taken: Taken = ignore_frame,
     split: ExposureSplit = WHOLE,
-) -> Exposure:  # fmt: skip
+) -> Exposure:
     """Return a dark frame, up to `count` lit ones, and one in each of `colours`; they are exposed in this order.
 
     With a `split` each of the `count` exposures is split into so many frames of equal length, without more light; the
@@ -437,9 +485,16 @@ def expose(
         lit = run.lit(Illumination(head.spec.light.colour), part, count, split.parts)
         overhead_s, (others, missing) = run.overhead_s, run.colours(colours)
         return Exposure(
-            lit, others, dark, run.begin_s, run.duration_s, run.given_j_per_cm2, missing=missing, split=split,
+            lit,
+            others,
+            dark,
+            run.begin_s,
+            run.duration_s,
+            run.given_j_per_cm2,
+            missing=missing,
+            split=split,
             overhead_s=overhead_s,
-        )  # fmt: skip
+        )
     finally:
         head.light.off()
 
@@ -482,9 +537,18 @@ class _Exposing:
         """Return up to `count` exposures in one light, each split into `parts` frames of `shot`."""
         camera, self.overhead_s, self._reported_s = self._head.camera, 0.0, self._clock.now_s()
         return burst(
-            camera, self._head.light, glow, shot, count, self._clock, self._eyes, in_visit=self._in_visit, parts=parts,
-            whole_s=self._head.spec.camera.exposure_s, taken=self.report,
-        )  # fmt: skip
+            camera,
+            self._head.light,
+            glow,
+            shot,
+            count,
+            self._clock,
+            self._eyes,
+            in_visit=self._in_visit,
+            parts=parts,
+            whole_s=self._head.spec.camera.exposure_s,
+            taken=self.report,
+        )
 
     def colours(self, colours: Sequence[Colour]) -> tuple[dict[Colour, Frame], dict[Colour, str]]:
         """Return one frame in each of `colours`, and the reason of each that could not be taken."""

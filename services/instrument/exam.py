@@ -42,10 +42,17 @@ class ExamService:
     """
 
     def __init__(
-        self, head: Head, store: CaptureStore, event_bus: EventBus, clock: Clock, plans: Path,
-        on_failure: Callable[[], None], watchdog: Watchdog, budget_s: Callable[[], float] = lambda: BUDGET_S,
+        self,
+        head: Head,
+        store: CaptureStore,
+        event_bus: EventBus,
+        clock: Clock,
+        plans: Path,
+        on_failure: Callable[[], None],
+        watchdog: Watchdog,
+        budget_s: Callable[[], float] = lambda: BUDGET_S,
         resumed_target: ResumedTarget = refuse_targets,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.head, self.store, self.ready = head, store, Event()
         self._watchdog = watchdog
         self._requests = requests = ExamRequests(clock)
@@ -58,9 +65,17 @@ class ExamService:
         for one in resumed:
             requests.remember(one.press)
         parts = ExamParts(
-            head, store, clock, watchdog, budget_s, requests, ExamEvents(event_bus, watchdog, self.progress, requests),
-            self.capture_journal, self.calibration_monitor, resumed,
-        )  # fmt: skip
+            head,
+            store,
+            clock,
+            watchdog,
+            budget_s,
+            requests,
+            ExamEvents(event_bus, watchdog, self.progress, requests),
+            self.capture_journal,
+            self.calibration_monitor,
+            resumed,
+        )
         origin = CaptureOrigin(head, store.folder)
         work = parts, lambda: plan_pipeline(head, clock, plans, origin), self.ready.set, on_failure
         self._thread = Thread(target=run_exam, args=work, name="head", daemon=True)

@@ -116,6 +116,12 @@ class ExamEvents:
 def stage_event(press: Press, id: str, now: ProgressEstimate, url: str | None = None) -> dict[str, object]:
     """Return the data of the event `stage`: progress of capture `id`, URL of its quick look, and its press."""
     return {
-        "id": id, "stage": now.stage, "fraction": now.fraction, "left_s": round(now.left_s, 2), "url": url,
-        "key": press.key, "visit": press.target.visit, "slot": press.target.slot,
-    }  # fmt: skip
+        "id": id,
+        "stage": now.stage,
+        "fraction": now.fraction,
+        "left_s": round(now.left_s, 2),
+        "url": url,
+        "key": press.key,
+        "visit": press.target.visit,
+        "slot": press.target.slot,
+    }

@@ -156,9 +156,20 @@ class ExamLoop:
         self._events.verdict(id, verdict)
         light = replace(self._parts.head.light.dose_report(), dose_j_per_cm2=exposure.dose_j_per_cm2)
         return ExposedCapture(
-            press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable,
-            exposure.colours, exposure.missing, notes=split_notes(exposure.split), prepared=prepared_frames(exposure),
-        )  # fmt: skip
+            press,
+            id,
+            taken_at,
+            exposure.lit,
+            exposure.dark,
+            exposure.duration_s,
+            light,
+            verdict,
+            exposure.unusable,
+            exposure.colours,
+            exposure.missing,
+            notes=split_notes(exposure.split),
+            prepared=prepared_frames(exposure),
+        )
 
     def _resume_oldest(self) -> None:
         """Queue the oldest press of the run before for reconstruction, with the frames that are on the disk."""

@@ -206,9 +206,11 @@ class HeadTransfer:
             self._finish(exam, session, calibration_error)
 
     def _finish(
-        self, exam: ExamService | None = None, session: CalibrationSession | TrialLensSession | None = None,
+        self,
+        exam: ExamService | None = None,
+        session: CalibrationSession | TrialLensSession | None = None,
         calibration_error: DiffuscopeError | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """End a transfer with a new owner."""
         with self._lock:
             self._owner = replace(

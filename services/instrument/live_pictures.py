@@ -20,9 +20,14 @@ class LivePictures:
     """
 
     def __init__(
-        self, light: GuardedLight, clock: Clock, pipeline: CapturePipeline, requests: ExamRequests, events: ExamEvents,
+        self,
+        light: GuardedLight,
+        clock: Clock,
+        pipeline: CapturePipeline,
+        requests: ExamRequests,
+        events: ExamEvents,
         refuse_in_vain: Callable[[], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._light, self._clock, self._pipeline = light, clock, pipeline
         self._requests, self._events, self._refuse_in_vain = requests, events, refuse_in_vain
 

@@ -25,6 +25,11 @@ class CaptureOrigin:
         if self._device is None:
             return None
         return RecordOrigin(
-            self._device.uuid, self._device.serial, version("diffuscope"), self._head, self._calibration_id,
-            self._calibrated_at, clock_state(self._root),
-        )  # fmt: skip
+            self._device.uuid,
+            self._device.serial,
+            version("diffuscope"),
+            self._head,
+            self._calibration_id,
+            self._calibrated_at,
+            clock_state(self._root),
+        )

@@ -72,9 +72,12 @@ class TrialLensRun:
         return CalibrationOutcome(failure=failure, lenses=self._outcome(readings, fit, None, failure))
 
     def _outcome(
-        self, readings: tuple[LensReading, ...], fit: TrialLensFit | None, stored: StoredCalibration | None,
+        self,
+        readings: tuple[LensReading, ...],
+        fit: TrialLensFit | None,
+        stored: StoredCalibration | None,
         failure: DiffuscopeError | None = None,
-    ) -> TrialLensOutcome:  # fmt: skip
+    ) -> TrialLensOutcome:
         return TrialLensOutcome(self._bench, readings, self._parts.clock.wall(), fit, stored, failure)
 
 
@@ -86,9 +89,12 @@ def check_stop(state: TrialLensState, watchdog: Watchdog) -> None:
 
 
 def run_trial_lenses(
-    parts: RunParts, state: TrialLensState, bench: LensBench, measure: Measure,
+    parts: RunParts,
+    state: TrialLensState,
+    bench: LensBench,
+    measure: Measure,
     on_end: Callable[[CalibrationOutcome], None],
-) -> None:  # fmt: skip
+) -> None:
     """Open the head, measure it with each lens, close it, and call `on_end` with the outcome at every exit."""
     outcome = CalibrationOutcome(failure=DiffuscopeError("the instrument stopped unexpectedly"), is_unexpected=True)
     try:

@@ -22,9 +22,12 @@ class TrialLensSession:
     """
 
     def __init__(
-        self, parts: RunParts, request: TrialLensRequest, on_end: Callable[[CalibrationOutcome], None],
+        self,
+        parts: RunParts,
+        request: TrialLensRequest,
+        on_end: Callable[[CalibrationOutcome], None],
         measure: Measure = LensCheck,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.bench = request.bench
         self._state = TrialLensState()
         work = parts, self._state, request.bench, measure, on_end

@@ -17,7 +17,7 @@ from device.clock import Clock, boot_id
 from device.errors import InputError
 from services import resources
 from services.errors import UpdateBusy, UpdateFailed, UpdateNoRoom, UpdateWrongDevice
-from services.update.ipc import (  # fmt: skip
+from services.update.ipc import (
     REQUEST_FILE,
     TABLET,
     UNDER_WAY,
@@ -114,10 +114,19 @@ class UpdateRequests:
         state = "asked" if waits else stage_of(entry, self._version, self._boot)
         trouble = self._timeout_error or (None if state in ("asked", "committed") else entry.trouble)
         return UpdateStatus(
-            here=True, runs=self._version, state=state, found=entry.found, trouble=trouble,
-            news=tuple(release_notes(self._version)) if state == "committed" else (), took_s=entry.took_s,
-            version=entry.version, before=entry.before, share=entry.share, offered=entry.offered, looked=entry.looked,
-        )  # fmt: skip
+            here=True,
+            runs=self._version,
+            state=state,
+            found=entry.found,
+            trouble=trouble,
+            news=tuple(release_notes(self._version)) if state == "committed" else (),
+            took_s=entry.took_s,
+            version=entry.version,
+            before=entry.before,
+            share=entry.share,
+            offered=entry.offered,
+            looked=entry.looked,
+        )
 
     def request(self, request: UpdateRequest) -> None:
         """Write a request file for the updater.

@@ -127,9 +127,18 @@ def benchmark(
         except DiffuscopeError as error:
             run.leave_out(entry.name, None, error, progress)
     found = Benchmark(
-        this_machine(), versions(), dataset.layout.title, tuple(entry.name for entry in dataset.entries), TIMING, FIT,
-        RANGE, PLANES, rows(run.scores), tuple(run.scores), tuple(run.left_out),
-    )  # fmt: skip
+        this_machine(),
+        versions(),
+        dataset.layout.title,
+        tuple(entry.name for entry in dataset.entries),
+        TIMING,
+        FIT,
+        RANGE,
+        PLANES,
+        rows(run.scores),
+        tuple(run.scores),
+        tuple(run.left_out),
+    )
     if request.json is not None:
         place, text = request.json, json.dumps(asdict(found), indent=1) + "\n"
         write_or_raise(place, lambda: place.write_text(text, encoding="utf-8"))
@@ -140,9 +149,14 @@ class _Run:
     """Measurement of one data set: scores so far, and the reconstructors planned for its last pair."""
 
     def __init__(
-        self, dataset: Dataset, methods: Mapping[str, Method], repeats: int, planner: Planner, clock: Clock,
+        self,
+        dataset: Dataset,
+        methods: Mapping[str, Method],
+        repeats: int,
+        planner: Planner,
+        clock: Clock,
         peer: LenslessPeer | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.layout, self.methods, self.repeats = dataset.layout, methods, repeats
         self.planner, self.clock, self.peer = planner, clock, peer
         self.scores: list[PairScore] = []
@@ -208,9 +222,15 @@ class _Run:
         kept = self._planned.get(recipe.method)
         if kept is None or kept.shape != pair.shape or not _equal(kept.calibration, calibration):
             kept = Reconstructor(
-                calibration, pair.shape, self.planner, self.clock, (recipe,), refract=False, timed=False,
+                calibration,
+                pair.shape,
+                self.planner,
+                self.clock,
+                (recipe,),
+                refract=False,
+                timed=False,
                 methods=self.methods,
-            )  # fmt: skip
+            )
             kept(pair.raw.pixels, rounds=1)  # untimed: the first frame of a type compiles its kernels
             self._planned[recipe.method] = kept
         return kept

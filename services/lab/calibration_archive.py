@@ -18,7 +18,7 @@ from services.lab.calibration_words import details, printable, summary
 app = typer.Typer(
     help="List the calibrations that are kept, put one in force, and bring them from head to head as signed files.",
     no_args_is_help=True,
-)  # fmt: skip
+)
 ArchiveOption = Annotated[Path, typer.Option("--archive", help="Where calibrations are kept.")]
 HeadOption = Annotated[Path | None, typer.Option(help="Head file; it must fit, and its memory is asked or written.")]
 IdArgument = Annotated[str, typer.Argument(metavar="ID", help="As `calibrations list` shows it.")]

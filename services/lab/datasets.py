@@ -27,10 +27,17 @@ UNSTATED = "not stated with the data; ask the authors before you pass them on"
 BSD = "BSD-3-Clause (Waller Lab, UC Berkeley)"
 
 DLMD = Layout(
-    "dlmd", "DiffuserCam Lensless Mirflickr Dataset (DLMD)", frames="upside down", truths="upside down", bgr=True,
-    region=Region(60, 270, 62, 442), region_of=(270, 480), aligned=True, citation=MONAKHOVA,
+    "dlmd",
+    "DiffuserCam Lensless Mirflickr Dataset (DLMD)",
+    frames="upside down",
+    truths="upside down",
+    bgr=True,
+    region=Region(60, 270, 62, 442),
+    region_of=(270, 480),
+    aligned=True,
+    citation=MONAKHOVA,
     licence="BSD-3-Clause for the authors' sample pairs; the whole set: as its page states",
-)  # fmt: skip
+)
 TUTORIAL = Layout("diffusercam-tutorial", "DiffuserCam tutorial", citation=DIFFUSERCAM, licence=BSD)
 DEPTHS = Layout("diffusercam-3d", "DiffuserCam, PSFs over depth", citation=DIFFUSERCAM, licence=BSD)
 EXPORT = Layout(

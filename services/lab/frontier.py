@@ -123,9 +123,14 @@ def frontier(request: FrontierRequest, progress: ProgressCallback, peer: Lensles
 
 
 def measure_frontier(
-    case: Case, plans: Path | None, budget_s: float, repeats: int, progress: ProgressCallback,
-    methods: Mapping[str, Method] = METHODS, peer: LenslessPeer | None = None,
-) -> Frontier:  # fmt: skip
+    case: Case,
+    plans: Path | None,
+    budget_s: float,
+    repeats: int,
+    progress: ProgressCallback,
+    methods: Mapping[str, Method] = METHODS,
+    peer: LenslessPeer | None = None,
+) -> Frontier:
     """Measure every point of one case with each of `methods`, and the instrument's choice within `budget_s`.
 
     A `peer` solves the same frame; the bursts of a case that has them follow.
@@ -184,8 +189,10 @@ def measure_scene(
 
 def table(found: Frontier) -> str:
     """Return as text the points from fast to slow (*: Pareto front), the best mus and the instrument's choice."""
-    lines = [f"{'':2}{'method':<10} {'bin':>3} {'rounds':>6} {'ms':>8} {'p95':>8} {'PSNR':>6} {'PCC':>6} {'SSIM':>6} "
-             f"{'detail':>6} {'vessel':>6}"]  # fmt: skip
+    lines = [
+        f"{'':2}{'method':<10} {'bin':>3} {'rounds':>6} {'ms':>8} {'p95':>8} {'PSNR':>6} {'PCC':>6} {'SSIM':>6} "
+        f"{'detail':>6} {'vessel':>6}"
+    ]
     for p in sorted(found.points, key=lambda p: p.seconds_median):
         vessel = "-" if p.vessel_contrast is None else f"{p.vessel_contrast:.3f}"
         lines.append(
@@ -194,8 +201,10 @@ def table(found: Frontier) -> str:
             f"{p.ssim:>6.3f} {p.highpass_pcc:>6.3f} {vessel:>6}"
         )
     for best in found.best_mu:
-        lines.append(f"  tikhonov with the best mu, {best.mu:.0e}, chosen by the truth: bin {best.bin}, "
-                     f"{best.psnr_db:.2f} dB, PCC {best.pcc:.3f}")  # fmt: skip
+        lines.append(
+            f"  tikhonov with the best mu, {best.mu:.0e}, chosen by the truth: bin {best.bin}, "
+            f"{best.psnr_db:.2f} dB, PCC {best.pcc:.3f}"
+        )
     choice = found.choice
     lines.append(
         f"within {found.budget_s:g} s the instrument chooses {choice.method}, bin {choice.bin}, "
@@ -242,9 +251,15 @@ class _Bench:
             rounds = [one.rounds for one in self.recipes if (one.method, one.bin) == key and one.rounds is not None]
             most = Recipe(*key, max(rounds, default=None))
             self.makers[key] = Reconstructor(
-                self.case.calibration, self.case.shape, self.planner, self.clock, (most,), refract=False,
-                timed=False, methods=self.methods,
-            )  # fmt: skip
+                self.case.calibration,
+                self.case.shape,
+                self.planner,
+                self.clock,
+                (most,),
+                refract=False,
+                timed=False,
+                methods=self.methods,
+            )
         return self.makers[key](self.case.counts, rounds=recipe.rounds)
 
     def _scored(self) -> list[tuple[Recipe, int, Scores]]:
@@ -341,10 +356,18 @@ class _Bench:
         scores = self.score(last)
         lead_db = (p.psnr_db - scores.psnr_db for p in points if p.seconds_median <= solve_s)
         choice = Choice(
-            method=report.method, bin=report.bin, rounds=report.rounds, stopped=report.stopped,
-            seconds_median=_summary(own)[0], seconds_p95=_summary(own)[1], within_budget=max(own) <= budget_s,
-            refract_s=refract_s, solve_s=solve_s, db_below_edge=max(0.0, *lead_db, 0.0), **asdict(scores),
-        )  # fmt: skip
+            method=report.method,
+            bin=report.bin,
+            rounds=report.rounds,
+            stopped=report.stopped,
+            seconds_median=_summary(own)[0],
+            seconds_p95=_summary(own)[1],
+            within_budget=max(own) <= budget_s,
+            refract_s=refract_s,
+            solve_s=solve_s,
+            db_below_edge=max(0.0, *lead_db, 0.0),
+            **asdict(scores),
+        )
         return points, choice
 
     def _times(
@@ -368,12 +391,17 @@ class _Bench:
     def region(self) -> ScoredRegion:
         """Return the scored region and the settings of the scores."""
         return ScoredRegion(
-            what=self.where, field_known=bool(np.isfinite(field_radius_px(self.case.calibration))),
-            pixels=int(self.judge.inside.sum()), intensity_fit=FIT, psnr_range=RANGE,
-            truth_variance=self.judge.truth_variance, ssim="sigma 1.5 px, 11 x 11, "
-            "K1 0.01, K2 0.03, on the region eroded by 5 px", highpass_sigma_px=self.detail_px,
-            shift_px=self.shift, truth_vessel_contrast=self.judge.truth_contrast,
-        )  # fmt: skip
+            what=self.where,
+            field_known=bool(np.isfinite(field_radius_px(self.case.calibration))),
+            pixels=int(self.judge.inside.sum()),
+            intensity_fit=FIT,
+            psnr_range=RANGE,
+            truth_variance=self.judge.truth_variance,
+            ssim="sigma 1.5 px, 11 x 11, K1 0.01, K2 0.03, on the region eroded by 5 px",
+            highpass_sigma_px=self.detail_px,
+            shift_px=self.shift,
+            truth_vessel_contrast=self.judge.truth_contrast,
+        )
 
 
 def _summary(seconds: list[float]) -> tuple[float, float]:

@@ -56,9 +56,14 @@ def light_case(spec: InstrumentSpec) -> LightCase:
 
 
 def measure_light(
-    case: LightCase, instrument: Reconstructor, planner: Planner, clock: Clock, truth: Image, judge: PictureScorer,
+    case: LightCase,
+    instrument: Reconstructor,
+    planner: Planner,
+    clock: Clock,
+    truth: Image,
+    judge: PictureScorer,
     progress: ProgressCallback,
-) -> tuple[LightPoint, ...]:  # fmt: skip
+) -> tuple[LightPoint, ...]:
     """Return what the instrument makes of bursts of NUMBERS frames; `judge` scores a picture.
 
     The time is the median of REPEATS, with that of the refraction.
@@ -76,9 +81,17 @@ def measure_light(
         bound = linear_bound(instrument.calibration, case.mean_dn, n, truth)
         used = sum(one.used for one in made.report.frames) if n > 1 else 1
         point = LightPoint(
-            n, used, n * case.dose_j_per_cm2, float(np.median(seconds)), scores.pcc, scores.psnr_db, scores.ssim,
-            scores.highpass_pcc, scores.vessel_contrast, judge(bound).psnr_db,
-        )  # fmt: skip
+            n,
+            used,
+            n * case.dose_j_per_cm2,
+            float(np.median(seconds)),
+            scores.pcc,
+            scores.psnr_db,
+            scores.ssim,
+            scores.highpass_pcc,
+            scores.vessel_contrast,
+            judge(bound).psnr_db,
+        )
         progress(f"{n} frames: {point.psnr_db:.2f} dB, linear bound {point.bound_psnr_db:.2f} dB")
         found.append(point)
     return tuple(found)

@@ -88,9 +88,15 @@ def dataset_request(request: FrontierRequest, folder: Path, limit: int | None) -
         require_writable(place)
     Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
     return DatasetFrontierRequest(
-        open_dataset(folder, request.psf), limit, request.json, request.plot, request.budget_s, request.repeats,
-        request.plans, request.methods,
-    )  # fmt: skip
+        open_dataset(folder, request.psf),
+        limit,
+        request.json,
+        request.plot,
+        request.budget_s,
+        request.repeats,
+        request.plans,
+        request.methods,
+    )
 
 
 def frontier_of_dataset(
@@ -120,15 +126,24 @@ def frontier_of_dataset(
             except DiffuscopeError as error:
                 left_out.append(left(entry.name, "LenslessPiCam", error, progress))
     if not frontiers:
-        raise FrameError(f"no pair of {dataset.folder} can be measured: {'; '.join(map(str, left_out))}",
-                         "Give pairs with truths; `diffuscope data FOLDER --check` names what is missing.")  # fmt: skip
+        raise FrameError(
+            f"no pair of {dataset.folder} can be measured: {'; '.join(map(str, left_out))}",
+            "Give pairs with truths; `diffuscope data FOLDER --check` names what is missing.",
+        )
     result = DatasetFrontier(
-        this_machine(), versions(), dataset.layout.title, tuple(found.scene for found in frontiers), FIT, RANGE,
-        "mean of the channels", request.budget_s, _sorted(rows(scores)), tuple(left_out), tuple(frontiers),
-    )  # fmt: skip
-    text, picture = json.dumps(asdict(result), indent=1) + "\n", draw_frontier(mean_frontier(result), methods)
-    write_or_raise(request.json, lambda: request.json.write_text(text, encoding="utf-8"))
-    write_or_raise(request.plot, lambda: request.plot.write_text(picture, encoding="utf-8"))
+        this_machine(),
+        versions(),
+        dataset.layout.title,
+        tuple(found.scene for found in frontiers),
+        FIT,
+        RANGE,
+        "mean of the channels",
+        request.budget_s,
+        _sorted(rows(scores)),
+        tuple(left_out),
+        tuple(frontiers),
+    )
+    _write(request, result, draw_frontier(mean_frontier(result), methods))
     return result
 
 
@@ -160,12 +175,9 @@ def _scores(pair: str, found: Frontier) -> list[PairScore]:
     """Return the scores of every point of one pair, and of the instrument's choice."""
     own = found.choice
     return [
-        *(
-            PairScore(pair, p.method, p.bin, p.rounds, p.seconds_median, p.psnr_db, p.ssim, p.pcc)
-            for p in found.points
-        ),
+        *(PairScore(pair, p.method, p.bin, p.rounds, p.seconds_median, p.psnr_db, p.ssim, p.pcc) for p in found.points),
         PairScore(pair, CHOICE, 0, 0, own.solve_s, own.psnr_db, own.ssim, own.pcc),
-    ]  # fmt: skip
+    ]
 
 
 def _sorted(found: Sequence[Row]) -> tuple[Row, ...]:
@@ -189,10 +201,13 @@ def mean_frontier(found: DatasetFrontier) -> Frontier:
     first = found.frontiers[0]
     kept = {point.method for point in points if point.pareto}
     return replace(
-        first, scene=f"{found.data_set}, {len(found.frontiers)} pairs", points=tuple(points), best_mu=(),
+        first,
+        scene=f"{found.data_set}, {len(found.frontiers)} pairs",
+        points=tuple(points),
+        best_mu=(),
         choice=_median_choice([one.choice for one in found.frontiers]),
         dominated=tuple(name for name in dict.fromkeys(p.method for p in points) if name not in kept),
-    )  # fmt: skip
+    )
 
 
 def _key(point: Point) -> tuple[str, int, int]:
@@ -202,11 +217,17 @@ def _key(point: Point) -> tuple[str, int, int]:
 def _mean_point(group: Sequence[Point]) -> Point:
     first = group[0]
     return Point(
-        first.method, first.bin, first.rounds, float(np.median([p.seconds_median for p in group])),
-        float(np.median([p.seconds_p95 for p in group])), float(np.mean([p.pcc for p in group])),
-        float(np.mean([p.psnr_db for p in group])), float(np.mean([p.ssim for p in group])),
-        float(np.mean([p.highpass_pcc for p in group])), None,
-    )  # fmt: skip
+        first.method,
+        first.bin,
+        first.rounds,
+        float(np.median([p.seconds_median for p in group])),
+        float(np.median([p.seconds_p95 for p in group])),
+        float(np.mean([p.pcc for p in group])),
+        float(np.mean([p.psnr_db for p in group])),
+        float(np.mean([p.ssim for p in group])),
+        float(np.mean([p.highpass_pcc for p in group])),
+        None,
+    )
 
 
 def _median_choice(choices: Sequence[Choice]) -> Choice:
@@ -216,3 +237,9 @@ def _median_choice(choices: Sequence[Choice]) -> Choice:
 def dataset_table(found: DatasetFrontier) -> str:
     """Return the rows as text, from fast to slow, with the budget of the instrument's choice."""
     return f"{table(found.rows)}\n{CHOICE}: what the instrument chooses within {found.budget_s:g} s"
+
+
+def _write(request: DatasetFrontierRequest, result: DatasetFrontier, picture: str) -> None:
+    text = json.dumps(asdict(result), indent=1) + "\n"
+    write_or_raise(request.json, lambda: request.json.write_text(text, encoding="utf-8"))
+    write_or_raise(request.plot, lambda: request.plot.write_text(picture, encoding="utf-8"))

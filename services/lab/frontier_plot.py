@@ -91,11 +91,16 @@ def _refraction(found: Frontier) -> str:
 def _best_mus(found: Frontier) -> tuple[Series, ...]:
     """Return the paper's method by the paper's rule: the best mu of its range, chosen by the truth."""
     marks = tuple(
-        Mark(one.seconds_median, one.psnr_db, f"bin {one.bin}",
-             f"tikhonov with mu {one.mu:.0e}, the best of the paper's range, bin {one.bin}: "
-             f"{one.seconds_median * 1e3:.1f} ms, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}", 0.95)
+        Mark(
+            one.seconds_median,
+            one.psnr_db,
+            f"bin {one.bin}",
+            f"tikhonov with mu {one.mu:.0e}, the best of the paper's range, bin {one.bin}: "
+            f"{one.seconds_median * 1e3:.1f} ms, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}",
+            0.95,
+        )
         for one in found.best_mu
-    )  # fmt: skip
+    )
     return (Series("tikhonov, best mu", (marks,), 0),) if marks else ()
 
 
@@ -194,20 +199,29 @@ def _series(
 def _peers(found: Frontier) -> tuple[Series, ...]:
     """Return the marks of other people's solvers."""
     marks = tuple(
-        Mark(one.seconds, one.psnr_db, one.name.split(", ")[-1].removesuffix(" rounds"),
-             f"{one.name}: {one.seconds:.2f} s, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}", 0.9)
+        Mark(
+            one.seconds,
+            one.psnr_db,
+            one.name.split(", ")[-1].removesuffix(" rounds"),
+            f"{one.name}: {one.seconds:.2f} s, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}",
+            0.9,
+        )
         for one in found.peers
-    )  # fmt: skip
+    )
     return (Series("LenslessPiCam", (marks,), PEER_KIND),) if marks else ()
 
 
 def _bursts_in_time(found: Frontier) -> tuple[Series, ...]:
     """Return the bursts at their times, refraction included."""
     marks = tuple(
-        Mark(one.seconds_median, one.psnr_db, _frames(one),
-             f"{_frames(one)}: {one.seconds_median * 1e3:.0f} ms, {one.psnr_db:.2f} dB")
+        Mark(
+            one.seconds_median,
+            one.psnr_db,
+            _frames(one),
+            f"{_frames(one)}: {one.seconds_median * 1e3:.0f} ms, {one.psnr_db:.2f} dB",
+        )
         for one in found.light
-    )  # fmt: skip
+    )
     return (Series("burst", (marks,), BURST_KIND),) if marks else ()
 
 

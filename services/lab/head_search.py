@@ -91,14 +91,26 @@ def _candidates(base: Design, limits: Limits) -> Iterator[Candidate | None]:
 
 
 def _candidate(
-    base: Design, choice: LedChoice, leds: int, ring_mm: float, iris_um: float, exposure_s: float, frames: int,
+    base: Design,
+    choice: LedChoice,
+    leds: int,
+    ring_mm: float,
+    iris_um: float,
+    exposure_s: float,
+    frames: int,
     limits: Limits,
-) -> Candidate | None:  # fmt: skip
+) -> Candidate | None:
     around = ChainSpec(rows=1, cols=1, pitch_mm=1, axis=(0, -ring_mm / 2), leds=(0,))  # one LED stands for the ring
     design = replace(
-        base, radiometry=None, chain=around, colour=choice.colour, led=choice.led, emitter_mm=choice.emitter_mm,
-        exposure_s=exposure_s, optics=base.optics.model_copy(update={"iris_um": iris_um}),
-    )  # fmt: skip
+        base,
+        radiometry=None,
+        chain=around,
+        colour=choice.colour,
+        led=choice.led,
+        emitter_mm=choice.emitter_mm,
+        exposure_s=exposure_s,
+        optics=base.optics.model_copy(update={"iris_um": iris_um}),
+    )
     if iris_um / 1000 > widest_iris_mm(base):
         return None
     inner_mm = design.relay.angular_magnification * (ring_mm - choice.emitter_mm) / 2
@@ -113,9 +125,19 @@ def _candidate(
         return None
     electrons, worst = product(factors), max(shares, key=lambda share: share.used)
     return Candidate(
-        choice, leds, ring_mm, iris_um, exposure_s, frames, level, electrons, electrons * exp(-BELOW * log_sd(factors)),
-        half_period_um(design, electrons), worst.used * level, worst.name,
-    )  # fmt: skip
+        choice,
+        leds,
+        ring_mm,
+        iris_um,
+        exposure_s,
+        frames,
+        level,
+        electrons,
+        electrons * exp(-BELOW * log_sd(factors)),
+        half_period_um(design, electrons),
+        worst.used * level,
+        worst.name,
+    )
 
 
 def table(base: Design, most: int = 25) -> str:

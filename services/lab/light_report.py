@@ -107,9 +107,10 @@ def at_full_drive(design: Design, frames: int = 1) -> FullDrive:
     electrons = product(factors) * np.exp(logs.sum(axis=1)) * np.minimum(1, 1 / share)
     (low, half, high), (low_e, half_e, high_e) = (np.quantile(one, (0.05, 0.5, 0.95)) for one in (share, electrons))
     return FullDrive(
-        Spread(float(half), float(low), float(high)), float((share > 1).mean()),
+        Spread(float(half), float(low), float(high)),
+        float((share > 1).mean()),
         Spread(float(half_e), float(low_e), float(high_e)),
-    )  # fmt: skip
+    )
 
 
 def refuse_dark(design: Design) -> None:
@@ -134,11 +135,12 @@ def limit_shares(design: Design, beam: Beam, limits: Limits) -> tuple[LimitShare
     """Return the three irradiance limits with what a beam gives at full drive."""
     hazard, full = Hazard({design.colour: beam}, limits), Illumination(design.colour)
     return (
-        LimitShare("photochemical", 1e6 * hazard.photochemical_w_per_cm2(full),
-                   1e6 * limits.photochemical_w_per_cm2, "uW/cm2"),
+        LimitShare(
+            "photochemical", 1e6 * hazard.photochemical_w_per_cm2(full), 1e6 * limits.photochemical_w_per_cm2, "uW/cm2"
+        ),
         LimitShare("thermal", 1e3 * hazard.thermal_w_per_cm2(full), 1e3 * limits.thermal_w_per_cm2, "mW/cm2"),
         LimitShare("waist", 1e3 * hazard.waist_w_per_cm2(full), 1e3 * limits.waist_w_per_cm2, "mW/cm2"),
-    )  # fmt: skip
+    )
 
 
 def permitted_level(shares: tuple[LimitShare, ...]) -> float:
@@ -160,14 +162,20 @@ def table(design: Design, frames: int = 1) -> str:
     """Return chain, uncertainty, limits, permitted drive and gains of a design as text; errors as `refuse_dark`."""
     refuse_dark(design)
     factors, limits = chain(design, frames=frames), light_limits()
-    return "\n".join([
-        f"{design.title}: {design.colour}, {frames} frame(s) of {1000 * design.exposure_s:g} ms, "
-        f"electrons in a cell of {CELL_UM:g} um",
-        *_chain_lines(design, factors, frames), "",
-        *_limit_lines(design, limits, frames), *_build_lines(design, frames), "",
-        *_edge_lines(design, limits), "",
-        *_gain_lines(factors),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"{design.title}: {design.colour}, {frames} frame(s) of {1000 * design.exposure_s:g} ms, "
+            f"electrons in a cell of {CELL_UM:g} um",
+            *_chain_lines(design, factors, frames),
+            "",
+            *_limit_lines(design, limits, frames),
+            *_build_lines(design, frames),
+            "",
+            *_edge_lines(design, limits),
+            "",
+            *_gain_lines(factors),
+        ]
+    )
 
 
 def _chain_lines(design: Design, factors: tuple[Factor, ...], frames: int) -> list[str]:
@@ -234,11 +242,12 @@ def _edge_lines(design: Design, limits: Limits) -> list[str]:
     return [
         "the limits count the highest irradiance of a retina, that of the axis: "
         f"{design.highest_mw_per_cm2:.3g} mW/cm2 by {design.axis_mw_per_sr:.3g} mW/sr;",
-        "of it " + ", ".join(f"{share:.2f} at {deg:g} deg" for share, deg in zip(shares, EDGE_DEG, strict=True))
+        "of it "
+        + ", ".join(f"{share:.2f} at {deg:g} deg" for share, deg in zip(shares, EDGE_DEG, strict=True))
         + f" off the axis: a die of {cap.emitter_mm:g} mm shines through a hole of {cap.hole_mm:g} mm that ends "
         f"{cap.height_mm:.2f} mm before it",
         *light_tolerances.table(light_tolerances.tolerances(design, used, limits)),
-    ]  # fmt: skip
+    ]
 
 
 def _gain_lines(factors: tuple[Factor, ...]) -> list[str]:
@@ -259,8 +268,11 @@ def gains_svg(design: Design, frames: int = 1) -> str:
     gains = {cause: gain for cause, gain in possible_gains(factors).items() if gain > 1}
     spread, scale, y = simulated(factors), (WIDE - LEFT - 70) / log10(100), 92.0
     light = f"{spread.median:.0f} electrons in a cell of 10 um, 90 % between {spread.low:.0f} and {spread.high:.0f}"
-    parts = [text(16, 28, "Times more light if this were ideal", "title"), text(16, 48, design.title, "small quiet"),
-             text(16, 64, light, "small quiet")]  # fmt: skip
+    parts = [
+        text(16, 28, "Times more light if this were ideal", "title"),
+        text(16, 48, design.title, "small quiet"),
+        text(16, 64, light, "small quiet"),
+    ]
     for cause, gain in gains.items():
         long = max(1.0, scale * log10(min(gain, 100.0)))
         parts.append(text(LEFT - 8, y + 5, cause, "small", "end"))

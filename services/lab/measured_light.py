@@ -92,10 +92,11 @@ def judge(spec: InstrumentSpec, design: Design, reading: MeterReading, limits: L
     _refuse_implausible(reading, lamp.led.wavelength_um, unmeasured)
     intensity_mw_per_sr = reading.axis_uw / 1000 / AXIS_HOLE_SR
     beam = BeamSpec(
-        wavelength_um=reading.peak_nm / 1000, fwhm_um=reading.fwhm_nm / 1000,
+        wavelength_um=reading.peak_nm / 1000,
+        fwhm_um=reading.fwhm_nm / 1000,
         retina_mw_per_cm2=highest_mw_per_cm2(intensity_mw_per_sr, design.path.eye.focal_mm),
         waist_mw_per_cm2=reading.waist_mw_per_cm2,
-    )  # fmt: skip
+    )
     found = RadiometrySpec(
         measured=reading.meter, guard_factor=reading.guard_factor, **{reading.colour: beam}
     )  # the other colours stay at their worst
@@ -132,13 +133,23 @@ def words(reading: MeterReading, found: MeteredLight) -> str:
     """Return the shares of the limits, GO or NO GO, and the lines for the head file."""
     beam = found.radiometry.beam(reading.colour)
     assert beam is not None
-    verdict = "GO: full drive keeps every limit" if found.is_go else (
-        f"NO GO at full drive: the guard permits {found.permitted_level:g} of it"
-    )  # fmt: skip
-    return "\n".join([
-        *(f"{one.name:<14} {one.value:>9.3g} of {one.limit:g} {one.unit}: {one.used:.0%}" for one in found.shares),
-        verdict, "", "[light.radiometry]", f'measured = "{reading.meter}"', f"guard_factor = {reading.guard_factor:g}",
-        f"[light.radiometry.{reading.colour}]",
-        f"wavelength_um = {beam.wavelength_um:g}", f"fwhm_um = {beam.fwhm_um:g}",
-        f"retina_mw_per_cm2 = {beam.retina_mw_per_cm2:.4g}", f"waist_mw_per_cm2 = {beam.waist_mw_per_cm2:g}",
-    ])  # fmt: skip
+    verdict = (
+        "GO: full drive keeps every limit"
+        if found.is_go
+        else (f"NO GO at full drive: the guard permits {found.permitted_level:g} of it")
+    )
+    return "\n".join(
+        [
+            *(f"{one.name:<14} {one.value:>9.3g} of {one.limit:g} {one.unit}: {one.used:.0%}" for one in found.shares),
+            verdict,
+            "",
+            "[light.radiometry]",
+            f'measured = "{reading.meter}"',
+            f"guard_factor = {reading.guard_factor:g}",
+            f"[light.radiometry.{reading.colour}]",
+            f"wavelength_um = {beam.wavelength_um:g}",
+            f"fwhm_um = {beam.fwhm_um:g}",
+            f"retina_mw_per_cm2 = {beam.retina_mw_per_cm2:.4g}",
+            f"waist_mw_per_cm2 = {beam.waist_mw_per_cm2:g}",
+        ]
+    )

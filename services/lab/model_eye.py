@@ -237,9 +237,12 @@ def check_model_eye(head: Path, frame: ModelEyeFrame) -> ModelEyeResult:
     groups = sorted(retina_chart.BAR_GROUPS, key=lambda group: group.period_um)
     contrast = {int(group.period_um): modulation(made.picture, fit, group) for group in groups}
     rows = (
-        _resolution(contrast, peak_e, promise), _scale(fit, promise), _field(wide, fit, promise),
-        light_row(mean_e, promise), _grey(made.picture, fit),
-    )  # fmt: skip
+        _resolution(contrast, peak_e, promise),
+        _scale(fit, promise),
+        _field(wide, fit, promise),
+        light_row(mean_e, promise),
+        _grey(made.picture, fit),
+    )
     return ModelEyeResult(spec.name, frame.exposure_s, rows, contrast, fit, made.report.warnings, made.simulated)
 
 

@@ -63,22 +63,32 @@ def fit_chart(picture: Image, px_per_deg: float, field_deg: float) -> ChartFit:
     steps = np.array([0.5, 0.5, 0.02, 3.0])
 
     def loss(x: Floats) -> float:
-        trial = ChartFit(start.row + x[0] * steps[0], start.col + x[1] * steps[1], start.px_per_deg
-                         * (1 + x[2] * steps[2]), start.turn_deg + x[3] * steps[3], 0.0)  # fmt: skip
+        trial = ChartFit(
+            start.row + x[0] * steps[0],
+            start.col + x[1] * steps[1],
+            start.px_per_deg * (1 + x[2] * steps[2]),
+            start.turn_deg + x[3] * steps[3],
+            0.0,
+        )
         return -_agreement(small, trial, radius_deg)
 
     corners = np.vstack([np.zeros(4), np.eye(4)])
     best = optimize.minimize(
-        loss, np.zeros(4), method="Nelder-Mead",
+        loss,
+        np.zeros(4),
+        method="Nelder-Mead",
         options={"initial_simplex": corners, "xatol": 2e-3, "fatol": 1e-6, "maxfev": 400},
-    )  # fmt: skip
+    )
     row, col, scale, turn = best.x * steps
     middle = [(size - 1) / 2 for size in picture.shape]
     inner = [(size - 1) / 2 for size in small.shape]
     return ChartFit(
-        float(middle[0] + n * (start.row + row - inner[0])), float(middle[1] + n * (start.col + col - inner[1])),
-        float(n * start.px_per_deg * (1 + scale)), float((start.turn_deg + turn) % 360), -float(best.fun),
-    )  # fmt: skip
+        float(middle[0] + n * (start.row + row - inner[0])),
+        float(middle[1] + n * (start.col + col - inner[1])),
+        float(n * start.px_per_deg * (1 + scale)),
+        float((start.turn_deg + turn) % 360),
+        -float(best.fun),
+    )
 
 
 def modulation(picture: Image, fit: ChartFit, group: BarGroup) -> float:

@@ -18,9 +18,12 @@ from services.lab.reconstruct_file import refuse_output, refuse_overwriting, wri
 
 
 def montage_files(
-    pictures: Sequence[Path], output: Path, report: Path | None, progress: Callable[[str], None],
+    pictures: Sequence[Path],
+    output: Path,
+    report: Path | None,
+    progress: Callable[[str], None],
     head: Path | None = None,
-) -> Montage:  # fmt: skip
+) -> Montage:
     """Join picture files (.npy, .tiff or .png), write the montage and its report, and return it.
 
     The montage is marked as simulated if a picture is.
@@ -33,19 +36,22 @@ def montage_files(
     refuse_overwriting((output, report), pictures)
     px_per_deg = None if head is None else _scale_px_per_deg(head)
     joined = make_montage(
-        [read_picture(path) for path in pictures], lambda done: progress(f"{done} of {len(pictures)} pictures placed"),
+        [read_picture(path) for path in pictures],
+        lambda done: progress(f"{done} of {len(pictures)} pictures placed"),
         px_per_deg,
-    )  # fmt: skip
+    )
     for note in unstated_notes(pictures):
         progress(f"note: {note}")
     simulated = any(is_marked_simulated(path) for path in pictures)
     write_picture(output, joined.picture, simulated)
     if report is not None:
         entries = {
-            "placed": [asdict(one) for one in joined.placed], "origin_px": joined.origin_px,
-            "projection": joined.projection, "px_per_deg": joined.px_per_deg,
+            "placed": [asdict(one) for one in joined.placed],
+            "origin_px": joined.origin_px,
+            "projection": joined.projection,
+            "px_per_deg": joined.px_per_deg,
             KEY: simulated,
-        }  # fmt: skip
+        }
         text = json.dumps(entries, indent=1)
         write_or_raise(report, lambda: report.write_text(text + "\n", encoding="utf-8"))
     return joined

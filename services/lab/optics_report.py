@@ -74,7 +74,7 @@ def _side(name: str, side: Side, budget: OpticalBudget) -> list[Row]:
         (f"{name} side of the sensor", f"{side.sensor_mm:.2f} mm", fits),
         ("  strict field", f"{side.strict_field_deg:.1f} deg", "by the paper's rule D > d + 2s"),
         ("  edge of the field keeps", f"{side.captured:.2f}", half + enough),
-    ]  # fmt: skip
+    ]
 
 
 def _scale(chosen: Design, budget: OpticalBudget) -> list[Row]:
@@ -101,7 +101,7 @@ def _eye(chosen: Design, budget: OpticalBudget) -> list[Row]:
         ("ring at the pupil", f"{budget.ring_at_pupil_mm:.2f} mm", ring),
         ("first lens, clear", f"{budget.first_lens_mm:.1f} mm", _clear(budget.first_lens_mm, path.lens_mm)),
         ("beam at the splitter", f"{budget.splitter_mm:.1f} mm", _clear(budget.splitter_mm, path.splitter_mm / 2**0.5)),
-    ]  # fmt: skip
+    ]
 
 
 def _clear(needed_mm: float, there_mm: float) -> str:
@@ -121,10 +121,14 @@ def _light(chosen: Design, budget: OpticalBudget) -> list[Row]:
         ("light at the cornea", f"{light.cornea_mw:.3f} mW", f"{chosen.colour}, full drive; {known}"),
         ("light on the retina", f"{light.retina_mw_per_cm2:.3f} mW/cm2", inside),
         ("light in the image", f"{light.image_nw:.2f} nW", "of a human fundus, through crossed polarisers"),
-        ("electrons in a pixel", f"{budget.electrons_per_px:.0f} e-", f"in {1000 * chosen.exposure_s:g} ms,"
-         f" {light.electrons_per_px_s:.0f} e-/s; quantum efficiency of the paper's sensor"),
+        (
+            "electrons in a pixel",
+            f"{budget.electrons_per_px:.0f} e-",
+            f"in {1000 * chosen.exposure_s:g} ms,"
+            f" {light.electrons_per_px_s:.0f} e-/s; quantum efficiency of the paper's sensor",
+        ),
         ("expected half-period", f"{budget.half_period_um:.0f} um", f"{budget.half_period_deg:.2f} deg; {note}"),
-    ]  # fmt: skip
+    ]
 
 
 def comparison() -> str:

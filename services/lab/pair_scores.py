@@ -121,19 +121,24 @@ def rows(scores: Sequence[PairScore]) -> tuple[Row, ...]:
         groups.setdefault((score.method, score.bin, score.rounds), []).append(score)
     return tuple(
         Row(
-            *key, len(group), float(np.median([one.seconds for one in group])),
-            Spread.of([one.psnr_db for one in group]), Spread.of([one.ssim for one in group]),
+            *key,
+            len(group),
+            float(np.median([one.seconds for one in group])),
+            Spread.of([one.psnr_db for one in group]),
+            Spread.of([one.ssim for one in group]),
             Spread.of([one.pcc for one in group]),
         )
         for key, group in groups.items()
-    )  # fmt: skip
+    )
 
 
 def table(found: Sequence[Row]) -> str:
     """Return rows as text, in the given order."""
     width = max([len(row.method) for row in found] + [len("method")])
-    lines = [f"{'method':<{width}} {'bin':>3} {'rounds':>6} {'pairs':>5} {'seconds':>8} {'PSNR dB':>14} "
-             f"{'SSIM':>14} {'PCC':>14}"]  # fmt: skip
+    lines = [
+        f"{'method':<{width}} {'bin':>3} {'rounds':>6} {'pairs':>5} {'seconds':>8} {'PSNR dB':>14} "
+        f"{'SSIM':>14} {'PCC':>14}"
+    ]
     for row in found:
         lines.append(
             f"{row.method:<{width}} {row.bin or '-':>3} {row.rounds or '-':>6} {row.pairs:>5} "

@@ -70,11 +70,13 @@ class LenslessPeer:
         np.savez(self._folder / "in.npz", y=counts, psf=psf, rounds=np.array(self.rounds), memory=self.memory)
         return tuple(
             PeerPicture(
-                f"LenslessPiCam {one['version']} ADMM, {one['rounds']} rounds", one["ms"] / 1e3, one["mb"],
+                f"LenslessPiCam {one['version']} ADMM, {one['rounds']} rounds",
+                one["ms"] / 1e3,
+                one["mb"],
                 np.load(self._folder / f"{k}.npy"),
             )
             for k, one in enumerate(json.loads(self._answer()))
-        )  # fmt: skip
+        )
 
     def _answer(self) -> str:
         """Send one line to the process and return its answer; SettingError if it ends without one."""

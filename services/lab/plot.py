@@ -271,8 +271,14 @@ def _series(plot: Plot) -> list[str]:
 HOLLOW = "fill: none; stroke: var(--ink); stroke-width: 1.8"
 # Corners, direction of the first one and size of the marks after the circle.
 OUTLINES = (
-    (4, pi / 4, 1.25), (3, -pi / 2, 1.3), (4, 0, 1.3), (3, pi / 2, 1.3), (5, -pi / 2, 1.2), (6, 0, 1.15), (3, 0, 1.3),
-)  # fmt: skip
+    (4, pi / 4, 1.25),
+    (3, -pi / 2, 1.3),
+    (4, 0, 1.3),
+    (3, pi / 2, 1.3),
+    (5, -pi / 2, 1.2),
+    (6, 0, 1.15),
+    (3, 0, 1.3),
+)
 
 
 def _shape(k: int, x: float, y: float, r: float, hollow: bool = False) -> str:
@@ -353,8 +359,16 @@ def _free_position(
     for near in reach:
         right, left, middle = x + 10 + near, x - 10 - near - wide, x - wide / 2
         over, under, level = y - 7 - near - LINE_PX, y + 8 + near, y - LINE_PX / 2
-        for a, b in ((middle, over), (middle, under), (right, under), (left, over), (right, over), (left, under),
-                     (right, level), (left, level)):  # fmt: skip
+        for a, b in (
+            (middle, over),
+            (middle, under),
+            (right, under),
+            (left, over),
+            (right, over),
+            (left, under),
+            (right, level),
+            (left, level),
+        ):
             box = (a, b, a + wide, b + LINE_PX)
             fits = (
                 a > LEFT + 2 and a + wide < plot.width - RIGHT - 2 and b > TOP + 2 and box[3] < plot.height - BOTTOM - 2

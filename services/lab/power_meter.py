@@ -77,11 +77,14 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     uw_per_w_per_cm2 = 1e6 * (design.path.eye.focal_mm / 10) ** 2 * AXIS_HOLE_SR  # I = E f^2, into the hole
     on_s = ON_SHARE * spec.light.max_on_s
     return MeterRun(
-        spec, glow, on_s, ceil(seconds * DUTY / on_s),
+        spec,
+        glow,
+        on_s,
+        ceil(seconds * DUTY / on_s),
         expected_uw=glow.level * expected_uw(design),
         assumed_uw=glow.level * uw_per_w_per_cm2 * beam.retina_w_per_cm2,
         permitted_uw=uw_per_w_per_cm2 * most_w_per_cm2 / GUARD,
-    )  # fmt: skip
+    )
 
 
 def give_pulses(run: MeterRun, data: Path, clock: Clock, progress: Callable[[str], None]) -> None:
@@ -121,14 +124,16 @@ def judge_reading(run: MeterRun, shown_uw: float, *, peak: bool = False) -> Mete
 
 def announcement(run: MeterRun) -> str:
     """Return what will shine, and what the meter should show."""
-    return "\n".join([
-        f"{run.spec.name}: {run.glow.colour} at {run.glow.level:g} of full drive, {run.count} pulses of {run.on_s:g} s "
-        "with equal pauses",
-        f"through a hole of {AXIS_HOLE_MM:g} mm on the axis, {AXIS_DISTANCE_MM:g} mm behind the eye's pupil, where the "
-        "reading is highest; nothing stands in the pupil:",
-        f"expected {run.expected_uw:.3g} uW within a factor of two; the guard counts {run.assumed_uw:.3g} uW; "
-        f"an eye may have {run.permitted_uw:.3g} uW",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"{run.spec.name}: {run.glow.colour} at {run.glow.level:g} of full drive, {run.count} pulses of "
+            f"{run.on_s:g} s with equal pauses",
+            f"through a hole of {AXIS_HOLE_MM:g} mm on the axis, {AXIS_DISTANCE_MM:g} mm behind the eye's pupil, where "
+            "the reading is highest; nothing stands in the pupil:",
+            f"expected {run.expected_uw:.3g} uW within a factor of two; the guard counts {run.assumed_uw:.3g} uW; "
+            f"an eye may have {run.permitted_uw:.3g} uW",
+        ]
+    )
 
 
 def words(head: Path, run: MeterRun, verdict: MeterVerdict) -> str:
@@ -143,10 +148,12 @@ def words(head: Path, run: MeterRun, verdict: MeterVerdict) -> str:
         )
     times = verdict.axis_uw / run.expected_uw
     usual = 1 / LED_POWER_UNCERTAINTY <= times <= LED_POWER_UNCERTAINTY
-    return "\n".join([
-        f"GO at this level: {shown}, {times:.2g} times what is expected"
-        + ("" if usual else "; look at polarisers, LEDs and the meter's place before you go on"),
-        "Measure the brightest disc of 1 mm in the waist as well, and peak and width of the spectrum. Then:",
-        f"diffuscope light --head {head} --colour {run.glow.colour} --level {run.glow.level:g} "
-        f'--axis-uw {verdict.axis_uw:.4g} --waist-mw-per-cm2 W --peak-nm L --fwhm-nm B --meter "NAME, DATE"',
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"GO at this level: {shown}, {times:.2g} times what is expected"
+            + ("" if usual else "; look at polarisers, LEDs and the meter's place before you go on"),
+            "Measure the brightest disc of 1 mm in the waist as well, and peak and width of the spectrum. Then:",
+            f"diffuscope light --head {head} --colour {run.glow.colour} --level {run.glow.level:g} "
+            f'--axis-uw {verdict.axis_uw:.4g} --waist-mw-per-cm2 W --peak-nm L --fwhm-nm B --meter "NAME, DATE"',
+        ]
+    )

@@ -106,9 +106,13 @@ class ForwardModel:
     """
 
     def __init__(
-        self, psf: ImageSource, shape: tuple[int, int] | None = None, *, bin: int = 1,
+        self,
+        psf: ImageSource,
+        shape: tuple[int, int] | None = None,
+        *,
+        bin: int = 1,
         field_radius_px: float | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         source = _source(psf)
         kernel = without_hot_pixels(read_psf(source) if isinstance(source, Path) else as_psf(source, "the PSF"))
         sensor = shape or kernel.shape
@@ -200,9 +204,13 @@ class SimulatedScene:
 
 
 def simulate(
-    scene: str | Path, *, everything: bool = False, only: Sequence[str] = (), without: Sequence[str] = (),
+    scene: str | Path,
+    *,
+    everything: bool = False,
+    only: Sequence[str] = (),
+    without: Sequence[str] = (),
     frames: int = 1,
-) -> SimulatedScene:  # fmt: skip
+) -> SimulatedScene:
     """Return simulated exposures of a scene, with their ground truth.
 
     `scene`: a scene file, or the name of one of device/sim/scenes/, such as "healthy". Only the effects that could be
@@ -218,19 +226,30 @@ def simulate(
     colour = spec.light.colour
     mask = world.retina.vessels
     return SimulatedScene(
-        name=spec.name, raw=counts[0], truth=world.truth(colour),
+        name=spec.name,
+        raw=counts[0],
+        truth=world.truth(colour),
         psf=crop_or_pad(world.psf(colour), world.shape),
         vessels=None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5,
-        plan={one.name: one for one in world.plan}, frames=counts, world=world,
-    )  # fmt: skip
+        plan={one.name: one for one in world.plan},
+        frames=counts,
+        world=world,
+    )
 
 
 def frontier(
-    raw: ImageSource | None = None, psf: ImageSource | None = None, truth: ImageSource | None = None, *,
-    scene: str | Path | SimulatedScene | None = None, head: str | Path | SimulatedScene | None = None,
-    field_deg: float | None = None, method: str | Sequence[str] = (), budget_s: float = 0.26, repeats: int = 7,
+    raw: ImageSource | None = None,
+    psf: ImageSource | None = None,
+    truth: ImageSource | None = None,
+    *,
+    scene: str | Path | SimulatedScene | None = None,
+    head: str | Path | SimulatedScene | None = None,
+    field_deg: float | None = None,
+    method: str | Sequence[str] = (),
+    budget_s: float = 0.26,
+    repeats: int = 7,
     progress: Callable[[str], None] = lambda _: None,
-) -> Frontier:  # fmt: skip
+) -> Frontier:
     """Return accuracy against time of every method, bin and number of rounds, on this machine.
 
     Either `raw`, `psf` and `truth`, (rows, cols) of one grid (a shift and the intensity are fitted), or `scene`:
@@ -270,13 +289,23 @@ def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOpti
     dark, flat = given.get("dark"), given.get("flat")
     psfs = psf if isinstance(psf, list | tuple) else (psf,)
     return ReconstructOptions(
-        raw=Path(), psfs=psf_stack([_source(one) for one in psfs]), output=None, method=given.get("method"),
-        budget_s=given.get("budget_s"), dark=None if dark is None else _source(dark),
-        flat=None if flat is None else _source(flat), head=_head(given.get("head")),
-        field_deg=given.get("field_deg"), even=False, plans=resources.fft_plans(), bin=given.get("bin"),
-        rounds=given.get("rounds"), settings=dict(given.get("settings", {})), bayer=parse_bayer(given.get("bayer")),
+        raw=Path(),
+        psfs=psf_stack([_source(one) for one in psfs]),
+        output=None,
+        method=given.get("method"),
+        budget_s=given.get("budget_s"),
+        dark=None if dark is None else _source(dark),
+        flat=None if flat is None else _source(flat),
+        head=_head(given.get("head")),
+        field_deg=given.get("field_deg"),
+        even=False,
+        plans=resources.fft_plans(),
+        bin=given.get("bin"),
+        rounds=given.get("rounds"),
+        settings=dict(given.get("settings", {})),
+        bayer=parse_bayer(given.get("bayer")),
         refraction=given.get("refraction", True),
-    )  # fmt: skip
+    )
 
 
 def _raw(image: ImageSource) -> RawSource:

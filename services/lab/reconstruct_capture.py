@@ -75,9 +75,11 @@ class CaptureFrames:
 
 
 def frames_of_capture(
-    lit: Sequence[Source], colours: Mapping[Colour, Source], dark: Source | None = None,
+    lit: Sequence[Source],
+    colours: Mapping[Colour, Source],
+    dark: Source | None = None,
     unusable: Mapping[int, str] | None = None,
-) -> CaptureFrames:  # fmt: skip
+) -> CaptureFrames:
     """Return the frames of a capture with the light and the exposures that its raw files state."""
     stated = stated_by(lit[0])
     light = None if stated is None or stated.illumination is None else stated.illumination.colour
@@ -152,9 +154,11 @@ class CaptureReconstructor:
     """
 
     def __init__(
-        self, options: ReconstructOptions, planner: Planner | None = None,
+        self,
+        options: ReconstructOptions,
+        planner: Planner | None = None,
         colour_psfs: Mapping[Colour, tuple[Path, ...]] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         refuse_invalid(options)
         self._options, self._planner = options, planner or Planner(options.plans)
         self._colour_psfs = colour_psfs or {}
@@ -250,9 +254,12 @@ class CaptureReconstructor:
         of_raws = [note for one in loaded for note in one.notes]
         of_companions = companion_notes(self._options, plan.single.calibration)
         texts = (
-            *doubts(made.report, plan.single, of_raws), *rejections(loaded[:count], made.report.frames), *notes,
-            *of_companions, *of_raws,
-        )  # fmt: skip
+            *doubts(made.report, plan.single, of_raws),
+            *rejections(loaded[:count], made.report.frames),
+            *notes,
+            *of_companions,
+            *of_raws,
+        )
         report = file_report(made.report, plan.single, self._options)
         report = replace(report, warnings=tuple(dict.fromkeys((*report.warnings, *texts))))
         simulated = made.simulated or plan.single.calibration.simulated or any(one.simulated for one in loaded)
@@ -275,9 +282,14 @@ class _Plan:
     """Solvers of captures of one set of levels: of one frame, of the burst, and of the other colours."""
 
     def __init__(
-        self, options: ReconstructOptions, green: Calibration, others: Mapping[Colour, Calibration | str],
-        shape: tuple[int, int], planner: Planner, index: int,
-    ) -> None:  # fmt: skip
+        self,
+        options: ReconstructOptions,
+        green: Calibration,
+        others: Mapping[Colour, Calibration | str],
+        shape: tuple[int, int],
+        planner: Planner,
+        index: int,
+    ) -> None:
         self._budget_s, self._clock = options.budget_s, SystemClock()
         self.single = plan_reconstructor(options, green, shape, planner, index, quick=True)
         self._bursts = BurstReconstructor(self.single, planner, timed=self._budget_s is not None)
@@ -293,31 +305,42 @@ class _Plan:
         self._colours = ColourReconstructor(self.single, solvers) if others else None
 
     def solve(
-        self, lit: Sequence[Pixels], unusable: Mapping[int, str], dark: Image | None,
-        others: Mapping[Colour, Pixels], others_dark: Image | None, full_drive_s: Mapping[Colour, float],
-    ) -> Reconstruction:  # fmt: skip
+        self,
+        lit: Sequence[Pixels],
+        unusable: Mapping[int, str],
+        dark: Image | None,
+        others: Mapping[Colour, Pixels],
+        others_dark: Image | None,
+        full_drive_s: Mapping[Colour, float],
+    ) -> Reconstruction:
         """Return the picture, with `colour` if another colour was solved; at least one frame of the burst is usable."""
         deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
         order = sorted(range(len(lit)), key=lambda k: k in unusable)  # the first one must be usable
         reasons = {place: unusable[k] for place, k in enumerate(order) if k in unusable}
-        steps = self._bursts.steps(
-            [lit[k] for k in order], dark, simulated=False, deadline=deadline, unusable=reasons
-        )  # fmt: skip
+        steps = self._bursts.steps([lit[k] for k in order], dark, simulated=False, deadline=deadline, unusable=reasons)
         if self._colours is not None:
             solved = {name: counts for name, counts in others.items() if name not in self._missing}
             lights = self._lights_dn_per_s({**solved, "green": lit[order[0]]}, dark, others_dark, full_drive_s)
             steps = self._colours.steps(
-                steps, solved, others_dark, simulated=False, deadline=deadline, missing=self._missing,
+                steps,
+                solved,
+                others_dark,
+                simulated=False,
+                deadline=deadline,
+                missing=self._missing,
                 lights_dn_per_s=lights,
-            )  # fmt: skip
+            )
         (made,) = deque(steps, maxlen=1)
         assert isinstance(made, Reconstruction)
         return replace(made, report=replace(made.report, frames=_in_given_order(made.report, order)))
 
     def _lights_dn_per_s(
-        self, frames: Mapping[Colour, Pixels], dark: Image | None, others_dark: Image | None,
+        self,
+        frames: Mapping[Colour, Pixels],
+        dark: Image | None,
+        others_dark: Image | None,
         full_drive_s: Mapping[Colour, float],
-    ) -> dict[Colour, float]:  # fmt: skip
+    ) -> dict[Colour, float]:
         """Return the light of each colour at full drive; none without a white reference to compare with."""
         calibration = self.single.calibration
         return {

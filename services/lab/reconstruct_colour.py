@@ -158,9 +158,11 @@ def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planne
 
 
 def _joined(
-    sources: Sequence[ChannelSource], channels: Mapping[Colour, list[ChannelSource]],
-    made: Mapping[Colour, FileReconstruction], options: ReconstructOptions,
-) -> FileReconstruction:  # fmt: skip
+    sources: Sequence[ChannelSource],
+    channels: Mapping[Colour, list[ChannelSource]],
+    made: Mapping[Colour, FileReconstruction],
+    options: ReconstructOptions,
+) -> FileReconstruction:
     """Register the channels, join them, write the picture and return it with its report."""
     reference: Colour = "green" if "green" in made else next(iter(made))
     main = made[reference]
@@ -168,10 +170,14 @@ def _joined(
     lit = _field(channels[reference][0], main.picture, options)
     joined = join_colours(pictures, lit, main.report.bin)
     report = replace(
-        main.report, seconds=summed_seconds(made.values()), channels=joined.channels,
+        main.report,
+        seconds=summed_seconds(made.values()),
+        channels=joined.channels,
         frames=_frames(channels, made, sources),
-        warnings=_warnings(made, joined), psf_channels=len(made), given=given_options(options),
-    )  # fmt: skip
+        warnings=_warnings(made, joined),
+        psf_channels=len(made),
+        given=given_options(options),
+    )
     solved = FileReconstruction(joined.picture, report, any(one.simulated for one in made.values()))
     if options.output is not None:
         write_picture(options.output, solved.picture, solved.simulated)
@@ -188,9 +194,10 @@ def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -
 
 
 def _frames(
-    channels: Mapping[Colour, list[ChannelSource]], made: Mapping[Colour, FileReconstruction],
+    channels: Mapping[Colour, list[ChannelSource]],
+    made: Mapping[Colour, FileReconstruction],
     sources: Sequence[ChannelSource],
-) -> tuple[FrameUse, ...]:  # fmt: skip
+) -> tuple[FrameUse, ...]:
     """Return what became of every raw, in the order in which they were given."""
     place = {id(one): k for k, one in enumerate(sources)}
     uses = [

@@ -13,9 +13,13 @@ ENDING = ".tiff"  # linear float32, which image viewers open too
 
 
 def reconstruct_each(
-    raws: Sequence[Path], options: ReconstructOptions, folder: Path, reports: Path | None,
-    done: Callable[[str], None], progress: Callable[[str], None],
-) -> int:  # fmt: skip
+    raws: Sequence[Path],
+    options: ReconstructOptions,
+    folder: Path,
+    reports: Path | None,
+    done: Callable[[str], None],
+    progress: Callable[[str], None],
+) -> int:
     """Write FOLDER/<name of the raw>.tiff for each raw, and a report to `reports`; return the number of failed raws.
 
     `options` holds all other options (`raw` and `output` are ignored). `done` gets a line for each picture; `progress`

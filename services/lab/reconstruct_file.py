@@ -203,9 +203,13 @@ class _Plan:
     """Solvers for one shape and one set of levels: one for all channels, or one for each; planned for each used PSF."""
 
     def __init__(
-        self, options: ReconstructOptions, calibrations: tuple[Calibration, ...], shape: Shape, planner: Planner,
+        self,
+        options: ReconstructOptions,
+        calibrations: tuple[Calibration, ...],
+        shape: Shape,
+        planner: Planner,
         is_mosaic: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.calibrations, self.is_mosaic = calibrations, is_mosaic
         self._options, self.shape, self._planner, self._clock = options, shape, planner, SystemClock()
         self._solvers: dict[int, tuple[Reconstructor, ...]] = {}
@@ -232,10 +236,12 @@ class _Plan:
         main = made[0 if len(made) == 1 else _brightest(pixels)].report
         picture = made[0].picture if len(made) == 1 else np.stack([one.picture for one in made], axis=2)
         report = replace(
-            file_report(main, solvers[0], options), seconds=summed_seconds(made),
+            file_report(main, solvers[0], options),
+            seconds=summed_seconds(made),
             warnings=(*_united(made), *doubts(main, solvers[0], loaded.notes)),
-            psf_channels=len(made), bayer=loaded.bayer,
-        )  # fmt: skip
+            psf_channels=len(made),
+            bayer=loaded.bayer,
+        )
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
 
     def _planned(self, index: int) -> tuple[Reconstructor, ...]:
@@ -321,10 +327,14 @@ def _place_of(solver: Reconstructor, report: Report) -> int:
 def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[str, float]]:
     """Return the options that replaced a choice of the program, by their names."""
     single: dict[str, float | str | None] = {
-        "method": options.method, "bin": options.bin, "rounds": options.rounds, "budget_s": options.budget_s,
-        "field_deg": options.field_deg, "bayer": options.bayer,
+        "method": options.method,
+        "bin": options.bin,
+        "rounds": options.rounds,
+        "budget_s": options.budget_s,
+        "field_deg": options.field_deg,
+        "bayer": options.bayer,
         "refraction": None if options.refraction else "left out",
-    }  # fmt: skip
+    }
     given: dict[str, float | str | dict[str, float]] = {
         key: value for key, value in single.items() if value is not None
     }
@@ -332,9 +342,15 @@ def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[s
 
 
 def plan_reconstructor(
-    options: ReconstructOptions, calibration: Calibration, shape: Shape, planner: Planner, index: int, *,
-    quick: bool = False, main: bool = True,
-) -> Reconstructor:  # fmt: skip
+    options: ReconstructOptions,
+    calibration: Calibration,
+    shape: Shape,
+    planner: Planner,
+    index: int,
+    *,
+    quick: bool = False,
+    main: bool = True,
+) -> Reconstructor:
     """Return the reconstructor of the options, planned for a calibration and a frame shape; `index` is the PSF's.
 
     `quick`: with a quick look before the picture, as with a time budget. `main`: its report is shown, so it estimates
@@ -346,11 +362,19 @@ def plan_reconstructor(
     if quick and len(recipes) == 1:
         recipes = (default_schedule(calibration, shape, index)[0], *recipes)
     return Reconstructor(
-        calibration, shape, planner, SystemClock(), recipes, index, refract=main and options.refraction,
+        calibration,
+        shape,
+        planner,
+        SystemClock(),
+        recipes,
+        index,
+        refract=main and options.refraction,
         consistency=consistency,
-        timed=options.budget_s is not None, methods=METHODS if method is None else {**METHODS, method.name: method},
-        audience=Audience.FILES, field_fixed=options.field_fixed,
-    )  # fmt: skip
+        timed=options.budget_s is not None,
+        methods=METHODS if method is None else {**METHODS, method.name: method},
+        audience=Audience.FILES,
+        field_fixed=options.field_fixed,
+    )
 
 
 def _recipes(

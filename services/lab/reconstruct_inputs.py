@@ -337,12 +337,17 @@ def load_calibrations(
     simulated = loaded.simulated or (spec is not None and spec.camera.backend == "sim")
     return tuple(
         Calibration(
-            psfs=stack, sensor=_of_mean_green(sensor) if loaded.bayer is not None and c == 1 else sensor,
-            geometry=geometry, field_deg=field_deg, dark_dn=_plane(dark, c), flat=_plane(flat, c), bad=raw.bad,
+            psfs=stack,
+            sensor=_of_mean_green(sensor) if loaded.bayer is not None and c == 1 else sensor,
+            geometry=geometry,
+            field_deg=field_deg,
+            dark_dn=_plane(dark, c),
+            flat=_plane(flat, c),
+            bad=raw.bad,
             simulated=simulated,
         )
         for c, stack in enumerate(psfs.stacks if loaded.bayer is None else _for_three(psfs.stacks))
-    )  # fmt: skip
+    )
 
 
 def _for_three(stacks: tuple[tuple[Psf, ...], ...]) -> tuple[tuple[Psf, ...], ...]:
@@ -382,9 +387,11 @@ def _sensor(camera: CameraSpec, raw: Raw) -> Sensor:
     """Return the head's sensor in the counts of a raw file; an 8-bit file holds the upper 8 bits of the converter."""
     dropped = 2 ** (camera.bit_depth - 8) if raw.stored_bits == 8 and camera.bit_depth > 8 else 1
     return Sensor(
-        camera.black_dn / dropped, camera.gain_e_per_dn * dropped, camera.read_noise_e,
+        camera.black_dn / dropped,
+        camera.gain_e_per_dn * dropped,
+        camera.read_noise_e,
         min(camera.white_dn / dropped, raw.white_dn),
-    )  # fmt: skip
+    )
 
 
 def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Calibration:

@@ -96,30 +96,37 @@ FRAME: Mapping[str, JsonValue] = {
     "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
     "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
     "shift_px": {
-        "type": ["array", "null"], "items": {"type": "number"}, "minItems": 2, "maxItems": 2,
+        "type": ["array", "null"],
+        "items": {"type": "number"},
+        "minItems": 2,
+        "maxItems": 2,
         "description": "Rows and columns: what is at (r, c) of the reference, the first used frame of the channel, "
         "stands at (r, c) plus this in the frame, in pixels of the sensor. Null if the frame was not registered.",
     },
     "weight": {"type": "number", "description": "Share of the frame in the joined frame, 0 to 1."},
     "reason": {"type": ["string", "null"], "description": "Reason why the frame is not used; null if it is."},
-}  # fmt: skip
+}
 CHANNEL: Mapping[str, JsonValue] = {
     "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
     "shift_px": {
-        "type": ["array", "null"], "items": {"type": "number"}, "minItems": 2, "maxItems": 2,
+        "type": ["array", "null"],
+        "items": {"type": "number"},
+        "minItems": 2,
+        "maxItems": 2,
         "description": "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at "
         "(r, c) plus this in this channel, in pixels of the raw. Null for a predicted or a missing channel.",
     },
     "predicted": {"type": "boolean", "description": "True if the channel was computed from the others, not measured."},
     "reason": {
-        "type": ["string", "null"], "description": "Why the picture has not this colour; null for one that it has.",
+        "type": ["string", "null"],
+        "description": "Why the picture has not this colour; null for one that it has.",
     },
     "white_ratio": {
         "type": ["number", "null"],
         "description": "Light of its frame over that of a white card in the same lamp light. Null without a white "
         "reference in the calibration: the hue is then that of photographs.",
     },
-}  # fmt: skip
+}
 VERDICT: Mapping[str, str] = {
     "saturated": "Share of saturated pixels of the raw frame, 0 to 1.",
     "light_e_per_um2": "Mean light on the sensor in electrons per um^2.",
@@ -166,33 +173,40 @@ EYE_AT_BY: dict[str, JsonValue] = {
 }
 FILES: Mapping[str, JsonValue] = {
     "solved": _typed(
-        "array", "Rows and columns of the solved frame, in samples of bin x bin pixels.",
-        items={"type": "integer"}, minItems=2, maxItems=2,
+        "array",
+        "Rows and columns of the solved frame, in samples of bin x bin pixels.",
+        items={"type": "integer"},
+        minItems=2,
+        maxItems=2,
     ),
     "given": _typed(
-        "object", "Options that replaced a choice of the program, by name; those of the method are in `settings`.",
+        "object",
+        "Options that replaced a choice of the program, by name; those of the method are in `settings`.",
         additionalProperties={"type": ["number", "string", "object"]},
     ),
     "psf_channels": _typed("integer", "Number of PSFs for the channels of the raw; 1: one PSF for all."),
     "bayer": _text("Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."),
-}  # fmt: skip
+}
 CAPTURE: Mapping[str, JsonValue] = {
     "dose_j_per_cm2": _figure("Light dose of this exposure at the retina in J/cm2."),
     "dose_24h_j_per_cm2": _typed(
-        "object", "Light dose of each eye in the last 24 hours in J/cm2, with this exposure.",
+        "object",
+        "Light dose of each eye in the last 24 hours in J/cm2, with this exposure.",
         properties={"OD": _number("Right eye."), "OS": _number("Left eye.")},
     ),
     "dose_stop_j_per_cm2": _figure("Dose in 24 hours at which an eye gets no more light, in J/cm2."),
     "dose_high": _typed("array", "Eyes whose dose is above the warning.", items={"type": "string"}),
     "limits_unchecked": _typed(
-        "array", "Names of the light limits that were not compared with the purchased standard.",
+        "array",
+        "Names of the light limits that were not compared with the purchased standard.",
         items={"type": "string"},
     ),
     "visit": _text("Identifier of the visit; null for a test picture."),
     "slot": _text("Picture slot of the programme, for example R-centre; null for a test picture."),
     "test": _typed("boolean", "True for a test picture, which belongs to no visit."),
     "verdict": _typed(
-        ["object", "null"], "Verdict for the operator.",
+        ["object", "null"],
+        "Verdict for the operator.",
         properties={
             "word": _text('"good" or "again".'),
             "code": _text("Cause of the verdict, for example shot.moved; null if good."),
@@ -202,19 +216,24 @@ CAPTURE: Mapping[str, JsonValue] = {
         },
     ),
     "laterality": _typed(
-        ["object", "null"], "Estimate of the eye that the picture shows.",
+        ["object", "null"],
+        "Estimate of the eye that the picture shows.",
         properties={
             "eye": _eye("OD (right) or OS (left); null if uncertain."),
             "confidence": _number("0 to 1."),
             "disc": _typed(
-                ["array", "null"], "Row and column of the optic disc in the picture, in pixels of the sensor.",
-                items={"type": "number"}, minItems=2, maxItems=2,
+                ["array", "null"],
+                "Row and column of the optic disc in the picture, in pixels of the sensor.",
+                items={"type": "number"},
+                minItems=2,
+                maxItems=2,
             ),
         },
     ),
     "budget_s": _number("Time budget of the reconstruction in s."),
     "moved": _typed(
-        "array", "Corrections of the eye, oldest first; only if there are any.",
+        "array",
+        "Corrections of the eye, oldest first; only if there are any.",
         items={
             "type": "object",
             "properties": {
@@ -224,11 +243,10 @@ CAPTURE: Mapping[str, JsonValue] = {
             },
         },
     ),
-    "confirmed": _typed(
-        "object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY
-    ),
+    "confirmed": _typed("object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY),
     "device": _typed(
-        "object", "Origin of the capture; captures of earlier releases have none.",
+        "object",
+        "Origin of the capture; captures of earlier releases have none.",
         properties={
             "uuid": _text("UUID of the device, made with its data folder."),
             "serial": _text("Serial number of its board."),
@@ -243,7 +261,7 @@ CAPTURE: Mapping[str, JsonValue] = {
         },
     ),
     "simulated": _typed("boolean", "True if the frame shows no real eye."),
-}  # fmt: skip
+}
 
 
 def _refraction() -> dict[str, JsonValue]:

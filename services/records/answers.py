@@ -100,8 +100,15 @@ def _wrong(value: object, remedy: str) -> InputError:
 
 IDENTIFIERS: dict[str, Validator] = {"name": _text(120), "phone": _text(40), "village": _text(120)}
 FIELDS: dict[str, Validator] = IDENTIFIERS | {
-    "consent": _one_of("agreed", "declined"), "age": _whole(MAX_AGE_YEARS), "sex": _one_of("woman", "man", "other"),
-    "diabetes": _one_of("yes", "no", "unknown"), "diabetes_years": _years,
-    "vision_od": _one_of(*VISIONS), "vision_os": _one_of(*VISIONS), "glasses": _yes_or_no,
-    "drops_od": _moment, "drops_os": _moment, "complaints": _complaints,
-}  # fmt: skip
+    "consent": _one_of("agreed", "declined"),
+    "age": _whole(MAX_AGE_YEARS),
+    "sex": _one_of("woman", "man", "other"),
+    "diabetes": _one_of("yes", "no", "unknown"),
+    "diabetes_years": _years,
+    "vision_od": _one_of(*VISIONS),
+    "vision_os": _one_of(*VISIONS),
+    "glasses": _yes_or_no,
+    "drops_od": _moment,
+    "drops_os": _moment,
+    "complaints": _complaints,
+}

@@ -92,9 +92,12 @@ class CaptureJournal:
         self.interrupted = tuple(one for id, one in found.items() if id not in resumable)
 
     def begin(
-        self, press: InterruptedCapture, key: str | None = None, planned: int = FRAMES,
+        self,
+        press: InterruptedCapture,
+        key: str | None = None,
+        planned: int = FRAMES,
         colours: Sequence[OtherColour] = (),
-    ) -> FrameWriter:  # fmt: skip
+    ) -> FrameWriter:
         """Write the journal entry of the capture `press`, durable on return; return the writer of its frames.
 
         `key`: idempotency key of its request; `planned`, `colours`: as in `ResumableCapture`. Errors: StoreFull,

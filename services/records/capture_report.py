@@ -48,14 +48,20 @@ def verdict_as_json(verdict: PictureVerdict) -> dict[str, JsonValue]:
 def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
     made, light = report.reconstruction, report.light
     entries: dict[str, JsonValue] = {
-        **vars(made), "warnings": list(made.warnings), "frames": [_frame_as_json(one) for one in made.frames],
+        **vars(made),
+        "warnings": list(made.warnings),
+        "frames": [_frame_as_json(one) for one in made.frames],
         "channels": [_channel_as_json(one) for one in made.channels],
-        **vars(light), "dose_high": list(light.dose_high), "limits_unchecked": list(light.limits_unchecked),
-        "visit": report.visit, "slot": report.slot, "test": report.is_test,
+        **vars(light),
+        "dose_high": list(light.dose_high),
+        "limits_unchecked": list(light.limits_unchecked),
+        "visit": report.visit,
+        "slot": report.slot,
+        "test": report.is_test,
         "verdict": None if report.verdict is None else verdict_as_json(report.verdict),
         "laterality": None if report.laterality is None else _laterality_as_json(report.laterality),
         "budget_s": report.budget_s,
-    }  # fmt: skip
+    }
     if not made.frames:
         del entries["frames"]
     if not made.channels:
@@ -84,8 +90,12 @@ def origin_as_json(origin: RecordOrigin) -> dict[str, JsonValue]:
 
 def _version_as_json(one: CaptureVersion) -> dict[str, JsonValue]:
     known: dict[str, JsonValue] = {
-        "number": one.number, "result": one.result, "at": one.at, "method": one.method, "software": one.software,
-    }  # fmt: skip
+        "number": one.number,
+        "result": one.result,
+        "at": one.at,
+        "method": one.method,
+        "software": one.software,
+    }
     return known | dict(one.others)
 
 
@@ -107,8 +117,12 @@ def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
 
 def _correction_as_json(one: EyeCorrection) -> dict[str, JsonValue]:
     known: dict[str, JsonValue] = {
-        "from_eye": one.from_eye, "from_slot": one.from_slot, "eye": one.eye, "at": one.at, "by": one.by,
-    }  # fmt: skip
+        "from_eye": one.from_eye,
+        "from_slot": one.from_slot,
+        "eye": one.eye,
+        "at": one.at,
+        "by": one.by,
+    }
     return known | dict(one.others)
 
 

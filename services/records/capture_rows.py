@@ -19,9 +19,17 @@ from services.records.record_signing import refuse_changed
 from services.records.schema import CAPTURE_ROWID, CaptureRow, FileRow
 
 CAPTURES: Select[*tuple[Any, ...]] = select(
-    CAPTURE_ROWID, CaptureRow.id, CaptureRow.eye, CaptureRow.taken_at, CaptureRow.simulated, CaptureRow.calibration_id,
-    CaptureRow.report, CaptureRow.request, CaptureRow.revision, CaptureRow.record_sha256,
-)  # fmt: skip
+    CAPTURE_ROWID,
+    CaptureRow.id,
+    CaptureRow.eye,
+    CaptureRow.taken_at,
+    CaptureRow.simulated,
+    CaptureRow.calibration_id,
+    CaptureRow.report,
+    CaptureRow.request,
+    CaptureRow.revision,
+    CaptureRow.record_sha256,
+)
 CaptureColumns = Row[*tuple[Any, ...]]
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # capture id, and name of a file
 

@@ -135,9 +135,12 @@ def stored_frames(folder: Path) -> tuple[StoredFrame, ...]:
 
 def _note_of(file: WrittenFile, taken: TakenFrame) -> JsonObject:
     return {
-        "file_sha256": file.sha256, "length_bytes": file.length_bytes, "number": taken.frame.number,
-        "dose_j_per_cm2": taken.dose_j_per_cm2, "exposed_s": taken.exposed_s,
-    }  # fmt: skip
+        "file_sha256": file.sha256,
+        "length_bytes": file.length_bytes,
+        "number": taken.frame.number,
+        "dose_j_per_cm2": taken.dose_j_per_cm2,
+        "exposed_s": taken.exposed_s,
+    }
 
 
 def _checked(path: Path, note: JsonObject) -> StoredFrame:

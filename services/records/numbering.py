@@ -9,9 +9,17 @@ from device.errors import InputError
 
 # Damm 2004: quasigroup of order 10 without x*y = y*x for x != y; detects all single errors and adjacent swaps.
 DAMM = (
-    "0317598642", "7092154863", "4206871359", "1750983426", "6123045978",
-    "3674209581", "5869720134", "8945362017", "9438617205", "2581436790",
-)  # fmt: skip
+    "0317598642",
+    "7092154863",
+    "4206871359",
+    "1750983426",
+    "6123045978",
+    "3674209581",
+    "5869720134",
+    "8945362017",
+    "9438617205",
+    "2581436790",
+)
 MIN_DIGITS = 4
 MAX_LENGTH = 20
 _NUMBER = re.compile(rf"[A-Z0-9][A-Z0-9-]{{0,{MAX_LENGTH - 1}}}")

@@ -52,10 +52,15 @@ def capture_content(row: CaptureRow | Row[*tuple[Any, ...]], files: Iterable[Fil
     ValueError or TypeError if a value is no JSON.
     """
     return {
-        "id": row.id, "eye": row.eye, "taken_at": row.taken_at, "simulated": row.simulated,
-        "calibration_id": row.calibration_id, "request": row.request, "report": _parsed(row.report),
+        "id": row.id,
+        "eye": row.eye,
+        "taken_at": row.taken_at,
+        "simulated": row.simulated,
+        "calibration_id": row.calibration_id,
+        "request": row.request,
+        "report": _parsed(row.report),
         "files": {name: {"sha256": digest, "bytes": length} for name, digest, length in files},
-    }  # fmt: skip
+    }
 
 
 def patient_contents(session: Session, rows: Sequence[PatientRow]) -> dict[str, Content | ValueError]:
@@ -91,14 +96,19 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
 
     def content(row: VisitRow) -> Content:
         return {
-            "id": row.id, "patient_id": patients.get(row.person), "number": row.person, "day": row.day,
-            "begun_at": row.begun_at, "finished_at": row.finished_at,
+            "id": row.id,
+            "patient_id": patients.get(row.person),
+            "number": row.person,
+            "day": row.day,
+            "begun_at": row.begun_at,
+            "finished_at": row.finished_at,
             "outcome": None if row.outcome is None else _parsed(row.outcome),
-            "sent": row.sent, "request": row.request,
+            "sent": row.sent,
+            "request": row.request,
             "answers": {name: {"value": _parsed(value), "set_at": at} for name, (value, at) in answers[row.id]},
             "decisions": {slot: {"capture": capture, "reason": why} for slot, (capture, why) in slots[row.id]},
             "uploads": {at: _upload_content(upload) for at, upload in uploads[row.id]},
-        }  # fmt: skip
+        }
 
     return {row.id: _or_error(content, row) for row in rows}
 
@@ -248,10 +258,15 @@ def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[Up
     id, outcome = row_validation.text(content["id"]), content["outcome"]
     finished_at, sent, request = (_text_or_none(content[name]) for name in ("finished_at", "sent", "request"))
     row = VisitRow(
-        id=id, person=row_validation.text(content["number"]), day=_day(content["day"]),
-        begun_at=_moment(content["begun_at"]), finished_at=None if finished_at is None else _moment(finished_at),
-        outcome=None if outcome is None else json.dumps(as_object(outcome)), sent=sent, request=request,
-    )  # fmt: skip
+        id=id,
+        person=row_validation.text(content["number"]),
+        day=_day(content["day"]),
+        begun_at=_moment(content["begun_at"]),
+        finished_at=None if finished_at is None else _moment(finished_at),
+        outcome=None if outcome is None else json.dumps(as_object(outcome)),
+        sent=sent,
+        request=request,
+    )
     answers = [(row_validation.text(name), as_object(one)) for name, one in as_object(content["answers"]).items()]
     uploads = [_upload_row(id, at, as_object(one)) for at, one in as_object(content["uploads"]).items()]
     return (

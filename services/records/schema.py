@@ -347,8 +347,10 @@ class IdempotencyKeyRow(Base):
 
 RecordRow = PatientRow | VisitRow | CaptureRow
 RECORD_TABLES: dict[str, type[RecordRow]] = {
-    "patient": PatientRow, "visit": VisitRow, "capture": CaptureRow,
-}  # fmt: skip
+    "patient": PatientRow,
+    "visit": VisitRow,
+    "capture": CaptureRow,
+}
 RECORD_KEYS = {"patient": PatientRow.number, "visit": VisitRow.id, "capture": CaptureRow.id}
 
 

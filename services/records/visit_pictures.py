@@ -40,9 +40,11 @@ class VisitPictures:
         request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
         if id is None or slot is None:
             return CaptureTarget(
-                write_rows=self._row_writer(key), request=request, frames=self._protocol.frames,
+                write_rows=self._row_writer(key),
+                request=request,
+                frames=self._protocol.frames,
                 colours=self._protocol.colours,
-            )  # fmt: skip
+            )
         visit, protocol_slot = self._get(id), self._protocol.slot(slot)
         if protocol_slot.eye != eye:
             raise InputError(f"{slot} is a picture of {protocol_slot.eye}, not of {eye}", CHOOSE_REMEDY)
@@ -52,9 +54,17 @@ class VisitPictures:
         permit()
         tries = len(visit.slots[slot].captures)
         return CaptureTarget(
-            id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), request, permit,
-            self._protocol.frames, self._protocol.colours,
-        )  # fmt: skip
+            id,
+            slot,
+            tries,
+            self._protocol.retakes,
+            protocol_slot.field,
+            self._row_writer(key),
+            request,
+            permit,
+            self._protocol.frames,
+            self._protocol.colours,
+        )
 
     def resumed_target(self, interrupted: ResumableCapture) -> CaptureTarget:
         """Return the target of a capture whose frames the run before has taken, also in a visit that is finished.
@@ -65,9 +75,17 @@ class VisitPictures:
         request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
         field = None if entry.slot is None else self._protocol.slot(entry.slot).field
         return CaptureTarget(
-            entry.visit, entry.slot, entry.tries, self._protocol.retakes, field, self._row_writer(key), request,
-            self.permission(entry.visit), interrupted.planned, interrupted.colours,
-        )  # fmt: skip
+            entry.visit,
+            entry.slot,
+            entry.tries,
+            self._protocol.retakes,
+            field,
+            self._row_writer(key),
+            request,
+            self.permission(entry.visit),
+            interrupted.planned,
+            interrupted.colours,
+        )
 
     def permission(self, id: str | None) -> Permit:
         """Return a function that checks the consent of a visit, to be called before each light.

@@ -113,9 +113,15 @@ def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) 
                 for name, value in fields[row.id].items()
             }
             return Visit(
-                row.id, row.person, _day(row.day), row_validation.timestamp(row.begun_at), answers, slots, finished_at,
+                row.id,
+                row.person,
+                _day(row.day),
+                row_validation.timestamp(row.begun_at),
+                answers,
+                slots,
+                finished_at,
                 None if row.outcome is None else _outcome(row.outcome),
-            )  # fmt: skip
+            )
 
     return without_damaged(known, visit)
 

@@ -29,9 +29,17 @@ OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 WORLD_READABLE = 0o644  # independent of the umask: the reader is another user
 
 State = Literal[
-    "none", "looking", "fetching", "installing", "installed", "trying", "committed", "went back", "refused",
+    "none",
+    "looking",
+    "fetching",
+    "installing",
+    "installed",
+    "trying",
+    "committed",
+    "went back",
+    "refused",
     "interrupted",
-]  # fmt: skip
+]
 UNDER_WAY = ("looking", "fetching", "installing")
 Id = Field(pattern="^[0-9a-f]{16}$")
 

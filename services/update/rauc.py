@@ -44,9 +44,12 @@ class Rauc:
         info = json.loads(self._ask("info", "--output-format=json", str(bundle)))
         minimum = re.search(r"from (\S+) or newer", info["description"] or "")
         return Release(
-            info["compatible"], info["version"], minimum[1] if minimum else "0", info["build"] or "",
+            info["compatible"],
+            info["version"],
+            minimum[1] if minimum else "0",
+            info["build"] or "",
             any("boot" in image for image in info["images"]),
-        )  # fmt: skip
+        )
 
     def compatible(self) -> str:
         """Return the device type of this system (RAUC's `compatible`)."""

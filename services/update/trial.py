@@ -22,9 +22,14 @@ class Trial:
     """Trial of the running version `runs`; `report` is called with a line per step."""
 
     def __init__(
-        self, settings: UpdateSettings, clock: Clock, rauc: Rauc, chooser: BootChooser, runs: str,
+        self,
+        settings: UpdateSettings,
+        clock: Clock,
+        rauc: Rauc,
+        chooser: BootChooser,
+        runs: str,
         report: Callable[[str], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._settings, self._clock, self._rauc, self._chooser = settings, clock, rauc, chooser
         self._runs, self._report = runs, report
         self._journal = StateFile(settings.folder)

@@ -22,9 +22,13 @@ class Updater:
     """Updater of one device; `report` is called with a line per step; `runs` is the running version (default: ours)."""
 
     def __init__(
-        self, settings: UpdateSettings, clock: Clock, report: Callable[[str], None], chooser: BootChooser | None = None,
+        self,
+        settings: UpdateSettings,
+        clock: Clock,
+        report: Callable[[str], None],
+        chooser: BootChooser | None = None,
         runs: str | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._settings, self._clock, self._report = settings, clock, report
         self._chooser = chooser or BootChooser(state=settings.folder)
         self._rauc, self._journal = Rauc(settings.rauc), StateFile(settings.folder)

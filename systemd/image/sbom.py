@@ -48,9 +48,12 @@ def bill(root: Path, version: str, git_id: str) -> dict[str, object]:
     about = {"type": "firmware", "bom-ref": "diffuscope", "name": "diffuscope", "version": version}
     about["properties"] = [{"name": "git", "value": git_id}]  # type: ignore[assignment]
     return {
-        "bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1, "metadata": {"component": about},
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.6",
+        "version": 1,
+        "metadata": {"component": about},
         "components": parts,
-    }  # fmt: skip
+    }
 
 
 if __name__ == "__main__":

@@ -80,13 +80,28 @@ class Device:
     def _running(self, root: Path, more: tuple[str, ...]) -> Iterator[Machine]:
         loops = [f"--bind={path}" for path in _loop_devices()]
         words = [
-            "systemd-nspawn", "--quiet", "-D", str(root), "--register=no", "--keep-unit", "--private-network",
-            "--volatile=overlay", "--console=pipe", "--machine=diffuscope-device", "--bind=/dev/loop-control", *loops,
+            "systemd-nspawn",
+            "--quiet",
+            "-D",
+            str(root),
+            "--register=no",
+            "--keep-unit",
+            "--private-network",
+            "--volatile=overlay",
+            "--console=pipe",
+            "--machine=diffuscope-device",
+            "--bind=/dev/loop-control",
+            *loops,
             *(f"--bind={self.loops[slot]}:/dev/disk/by-partlabel/{name}" for slot, name in NAMES.items()),
-            f"--bind={self.data}:/data", f"--bind={self.chooser}:/boot/chooser",
-            f"--bind={self.folder / 'media'}:/media", f"--bind-ro={self.folder / 'cmdline'}:/run/cmdline", *more,
-            "/bin/sh", "-c", FIRST,
-        ]  # fmt: skip
+            f"--bind={self.data}:/data",
+            f"--bind={self.chooser}:/boot/chooser",
+            f"--bind={self.folder / 'media'}:/media",
+            f"--bind-ro={self.folder / 'cmdline'}:/run/cmdline",
+            *more,
+            "/bin/sh",
+            "-c",
+            FIRST,
+        ]
         log = self.folder / "console"
         with log.open("wb") as console:
             nspawn = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=console, stderr=console)

@@ -169,8 +169,9 @@ def test_bundle_of_a_card_needs_the_kernel_of_its_root(card: Path, tmp_path: Pat
     keyring = f"--keyring={card.parents[1] / 'keys/ca.crt'}"
     info = json.loads(run("rauc", keyring, "info", "--output-format=json", ours.with_suffix(".raucb")))
     assert {name: image["filename"] for one in info["images"] for name, image in one.items()} == {
-        "rootfs": "rootfs.img", "boot": "boot.img",
-    }  # fmt: skip
+        "rootfs": "rootfs.img",
+        "boot": "boot.img",
+    }
 
 
 def test_root_holds_no_kernel_and_no_autoboot_txt(card: Path, tmp_path: Path) -> None:

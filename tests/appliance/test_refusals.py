@@ -210,9 +210,12 @@ def test_channel_update_resumes_after_a_lost_connection(bench: Bench, bundles: B
     """Checked as by the timer, downloaded in two parts, installed on request."""
     content = bundles.newer.read_bytes()
     offer = {
-        "compatible": "diffuscope-pi5", "version": "2.0", "bundle": bundles.newer.name, "bytes": len(content),
+        "compatible": "diffuscope-pi5",
+        "version": "2.0",
+        "bundle": bundles.newer.name,
+        "bytes": len(content),
         "sha256": hashlib.sha256(content).hexdigest(),
-    }  # fmt: skip
+    }
     certificate, key = identity(tmp_path)
     with serve(certificate, key) as site, bench.service():
         site.files = {

@@ -48,16 +48,24 @@ def plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     own = "".join(
         f'{name}="{value}"\n'
         for name, value in {
-            "IGTOP": TREE, "IGROOT": TREE, "LAYER_HOOKS": TREE / "layer-hooks", "RPI_TEMPLATES": TREE / "templates/rpi",
-            "DYNROOT": here, "SRCROOT": CARD,
+            "IGTOP": TREE,
+            "IGROOT": TREE,
+            "LAYER_HOOKS": TREE / "layer-hooks",
+            "RPI_TEMPLATES": TREE / "templates/rpi",
+            "DYNROOT": here,
+            "SRCROOT": CARD,
         }.items()
-    )  # fmt: skip
+    )
     registry = run("ig", "metadata", "--emit", "registry.defs")
     (here / "env").write_text(registry + (here / "user").read_text() + HOST + own)
     folders = {
-        "DYNlayer": here / "layer", "SRCimage": CARD / "image", "SRClayer": CARD / "layer", "IGdevice": TREE / "device",
-        "IGimage": TREE / "image", "IGlayer": TREE / "layer",
-    }  # fmt: skip
+        "DYNlayer": here / "layer",
+        "SRCimage": CARD / "image",
+        "SRClayer": CARD / "layer",
+        "IGdevice": TREE / "device",
+        "IGimage": TREE / "image",
+        "IGlayer": TREE / "layer",
+    }
     path = ":".join(f"{name}={folder}" for name, folder in folders.items())
     outputs = "--env-out", here / "resolved", "--plan-out", here / "plan"
     run("ig", "pipeline", "--env-in", here / "env", "--layers", *LAYERS, "--path", path, *outputs)
@@ -85,10 +93,13 @@ def test_the_hook_before_the_image_lays_out_the_card(plan: Path, tmp_path: Path)
     for name in ("root", "out"):
         (tmp_path / name).mkdir()
     folders = {
-        "IGTOP": TREE, "SRCROOT": CARD, "IGconf_image_assetdir": CARD / "image",
+        "IGTOP": TREE,
+        "SRCROOT": CARD,
+        "IGconf_image_assetdir": CARD / "image",
         "IGconf_target_path": tmp_path / "root",
-        "IGconf_device_assetdir": TREE / "device" / "pi5", "IGconf_image_outputdir": tmp_path / "out",
-    }  # fmt: skip
+        "IGconf_device_assetdir": TREE / "device" / "pi5",
+        "IGconf_image_outputdir": tmp_path / "out",
+    }
     run("bash", "bin/runner", "pre-image", plan, **{name: str(folder) for name, folder in folders.items()})
     assert (tmp_path / "out/genimage.cfg").read_text() == (CARD / "image/genimage.cfg").read_text()
 

@@ -63,8 +63,9 @@ def test_healthy_version_is_committed(bench: Bench, page: Page, two: tuple[objec
     with bench.service():
         second.settle()
     assert (bench.chooser.committed(), second.status()[1]) == (
-        "B", "Updated to 2.0. It was tried, found well, and stays.",
-    )  # fmt: skip
+        "B",
+        "Updated to 2.0. It was tried, found well, and stays.",
+    )
     second.settle()  # nothing to settle at later boots
     assert bench.reports[-1] == "Version 2.0 is committed already."
 

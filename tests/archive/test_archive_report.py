@@ -24,11 +24,20 @@ def synthetic_rows(count: int) -> list[dict[str, object]]:
     for k in range(count):
         row: dict[str, object] = {"id": f"c{k}", "state": "done", "device": f"head-{k % 2}", "method": "variation"}
         row |= {
-            "before_cutoff_per_px": cutoff[k], "quality_cutoff_per_px": cutoff[k] * gain[k], "total_s": 0.5,
-            "quality_psf_score": 1 - age[k] / 3650, "calibration_age_days": age[k], "solve_s": 0.4, "messages": [],
-            "sphere_dpt": age[k] / 100 - 2, "sphere_sd_dpt": 0.2, "before_verdict": "again" if k % 7 == 0 else "good",
-            "before_cause": "dark" if k % 7 == 0 else None, "worker": "tcp://10.0.0.1:1", "simulated": True,
-        }  # fmt: skip
+            "before_cutoff_per_px": cutoff[k],
+            "quality_cutoff_per_px": cutoff[k] * gain[k],
+            "total_s": 0.5,
+            "quality_psf_score": 1 - age[k] / 3650,
+            "calibration_age_days": age[k],
+            "solve_s": 0.4,
+            "messages": [],
+            "sphere_dpt": age[k] / 100 - 2,
+            "sphere_sd_dpt": 0.2,
+            "before_verdict": "again" if k % 7 == 0 else "good",
+            "before_cause": "dark" if k % 7 == 0 else None,
+            "worker": "tcp://10.0.0.1:1",
+            "simulated": True,
+        }
         rows.append({"id": f"c{k}", "state": "quarantine", "reason": "no signal"} if k % 20 == 19 else row)
     return rows
 

@@ -31,9 +31,7 @@ from tests.stored_captures import write_store
 
 
 @pytest.fixture(scope="module")
-def whole(
-    scene: Scene, archive: Archive, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Path]:  # fmt: skip
+def whole(scene: Scene, archive: Archive, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A plan, and the folder of its uninterrupted run with one worker."""
     folder = tmp_path_factory.mktemp("whole")
     write_recording(folder / "recording", scene)

@@ -130,9 +130,10 @@ def same_results(plan: Plan, one: Path, other: Path) -> bool:
     first, second = ResultFolder(one), ResultFolder(other)
     return all(
         (first.place(name) / file).read_bytes() == (second.place(name) / file).read_bytes()
-        for name in (capture.result for capture in plan.captures) if first.has(name) or second.has(name)
+        for name in (capture.result for capture in plan.captures)
+        if first.has(name) or second.has(name)
         for file in ("picture.tiff", "report.json")
-    )  # fmt: skip
+    )
 
 
 def overhead_s(plan: Plan, root: Path, tasks: int = 2000) -> float:

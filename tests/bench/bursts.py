@@ -143,7 +143,7 @@ def _vessels(file: Path, place: tuple[float, float, float]) -> Mask | None:
     drawn = {
         "hrf": file.parents[1] / "manual1" / f"{file.stem}.tif",
         "chase": file.with_name(f"{file.stem}_1stHO.png"),
-    }  # fmt: skip
+    }
     path = next((one for name, one in drawn.items() if name in file.parts), None)
     return None if path is None else retina(photograph(path, place, IMX296)[..., 1], IMX296) > 0.5
 
@@ -186,9 +186,9 @@ def _smeared(plane: Image, psf: Image) -> Counts:
 
 def registration_error(joined: JoinedFrame, places: Places) -> float:
     """Return the rms error of the shifts about their mean, px per axis."""
-    errors = np.array([
-        np.subtract(one.shift_px, places[one.index]) for one in joined.frames if one.shift_px is not None
-    ])  # fmt: skip
+    errors = np.array(
+        [np.subtract(one.shift_px, places[one.index]) for one in joined.frames if one.shift_px is not None]
+    )
     return float(np.sqrt(((errors - errors.mean(axis=0)) ** 2).mean()))
 
 

@@ -27,9 +27,12 @@ def ciede2000(one: Floats, other: Floats) -> Floats:
     turn = np.where(c1 * c2 == 0, 0, turn)
     lightness, c, hue = (one[:, 0] + other[:, 0]) / 2, (c1 + c2) / 2, h1 + turn / 2
     t = (
-        1 - 0.17 * np.cos(hue - np.radians(30)) + 0.24 * np.cos(2 * hue)
-        + 0.32 * np.cos(3 * hue + np.radians(6)) - 0.2 * np.cos(4 * hue - np.radians(63))
-    )  # fmt: skip
+        1
+        - 0.17 * np.cos(hue - np.radians(30))
+        + 0.24 * np.cos(2 * hue)
+        + 0.32 * np.cos(3 * hue + np.radians(6))
+        - 0.2 * np.cos(4 * hue - np.radians(63))
+    )
     s_l = 1 + 0.015 * (lightness - 50) ** 2 / np.sqrt(20 + (lightness - 50) ** 2)
     s_c, s_h = 1 + 0.045 * c, 1 + 0.015 * c * t
     near_blue = np.exp(-(((np.degrees(hue) % 360 - 275) / 25) ** 2))

@@ -53,9 +53,19 @@ def colours(folder: Path, names: Sequence[str] = tuple(FIELDS)) -> None:
         makers[colour] = Reconstructor(calibration, PAPER.shape, PLANNER, CLOCK, steps, timed=False)
     n, random = makers["green"].stages[-1].grid.n, np.random.default_rng(7)
     timing.head(
-        "20 ke- red and green, 5 ke- blue", "red px", "own", "blue px", "own", "red dB", "guided", "blue dB", "guided",
-        "dE00", "no blue", "doubtful",
-    )  # fmt: skip
+        "20 ke- red and green, 5 ke- blue",
+        "red px",
+        "own",
+        "blue px",
+        "own",
+        "red dB",
+        "guided",
+        "blue dB",
+        "guided",
+        "dE00",
+        "no blue",
+        "doubtful",
+    )
     rows: list[list[float]] = []
     for k, name in enumerate(names):
         file, place = FIELDS[name]

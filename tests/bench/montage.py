@@ -39,10 +39,14 @@ OVERLAPS = (0.84, 0.64, 0.54, 0.48, 0.44, 0.36, 0.31, 0.27, 0.15, 0.12, 0.08)
 TORSIONS_DEG = (0.0, 3.0)
 SPAN = 1.9  # part of a photograph that is used, in fields
 PHOTOGRAPHS = {
-    "06_dr": ("hrf/images/06_dr.JPG", 1), "07_h": ("hrf/images/07_h.jpg", 2), "09_g": ("hrf/images/09_g.jpg", 3),
-    "01L": ("chase/Image_01L.jpg", 4), "05R": ("chase/Image_05R.jpg", 5), "11L": ("chase/Image_11L.jpg", 6),
+    "06_dr": ("hrf/images/06_dr.JPG", 1),
+    "07_h": ("hrf/images/07_h.jpg", 2),
+    "09_g": ("hrf/images/09_g.jpg", 3),
+    "01L": ("chase/Image_01L.jpg", 4),
+    "05R": ("chase/Image_05R.jpg", 5),
+    "11L": ("chase/Image_11L.jpg", 6),
     "cc0": ("skimage/retina.jpg", 7),
-}  # fmt: skip
+}
 LIT_DIAMETER = {"hrf": 3260, "chase": 900, "skimage": 1300}  # of the photographs, pixels
 Floats = NDArray[np.float64]
 
@@ -212,7 +216,7 @@ def same_eye(folder: Path, px_per_deg: float | None, stride: int) -> dict[Line, 
                 f"{one.used!s:5} error {error_px:5.2f} px, common {common_px:5.2f} px, {turn_deg:+.2f} deg, "
                 f"peak {one.peak:.2f}, overlap found {one.overlap:.2f}",
                 flush=True,
-            )  # fmt: skip
+            )
     return found
 
 

@@ -54,13 +54,18 @@ OPTICS = OpticsSpec(field_deg=FIELD_DEG, bandwidth_um=0.03)
 
 # Seven photographs; the field is a part of it: centre (x, y) and side as shares of the photograph's shorter side.
 FIELDS: dict[str, tuple[str, tuple[float, float, float]]] = {
-    "06_dr a": ("hrf/images/06_dr.JPG", (0.42, 0.5, 0.68)), "06_dr b": ("hrf/images/06_dr.JPG", (0.62, 0.5, 0.68)),
-    "07_h a": ("hrf/images/07_h.jpg", (0.40, 0.5, 0.68)), "07_h b": ("hrf/images/07_h.jpg", (0.62, 0.5, 0.68)),
-    "09_g a": ("hrf/images/09_g.jpg", (0.40, 0.5, 0.68)), "09_g b": ("hrf/images/09_g.jpg", (0.62, 0.5, 0.68)),
-    "cc0 a": ("skimage/retina.jpg", (0.42, 0.5, 0.68)), "cc0 b": ("skimage/retina.jpg", (0.58, 0.5, 0.68)),
-    "01L": ("chase/Image_01L.jpg", (0.5, 0.5, 0.85)), "05R": ("chase/Image_05R.jpg", (0.5, 0.5, 0.85)),
+    "06_dr a": ("hrf/images/06_dr.JPG", (0.42, 0.5, 0.68)),
+    "06_dr b": ("hrf/images/06_dr.JPG", (0.62, 0.5, 0.68)),
+    "07_h a": ("hrf/images/07_h.jpg", (0.40, 0.5, 0.68)),
+    "07_h b": ("hrf/images/07_h.jpg", (0.62, 0.5, 0.68)),
+    "09_g a": ("hrf/images/09_g.jpg", (0.40, 0.5, 0.68)),
+    "09_g b": ("hrf/images/09_g.jpg", (0.62, 0.5, 0.68)),
+    "cc0 a": ("skimage/retina.jpg", (0.42, 0.5, 0.68)),
+    "cc0 b": ("skimage/retina.jpg", (0.58, 0.5, 0.68)),
+    "01L": ("chase/Image_01L.jpg", (0.5, 0.5, 0.85)),
+    "05R": ("chase/Image_05R.jpg", (0.5, 0.5, 0.85)),
     "11L": ("chase/Image_11L.jpg", (0.5, 0.5, 0.85)),
-}  # fmt: skip
+}
 
 
 def eye_dpt(colour: Colour) -> float:
@@ -151,9 +156,12 @@ def calibrated(sensor: SensorCase, colour: Colour) -> Calibration:
     sd_e = np.sqrt((clean_e + 2 * sensor.read_e**2 + sensor.gain_e**2 / 6) / CALIBRATION_FRAMES)
     pixels = (clean_e + sd_e * random.standard_normal(clean_e.shape)).astype(np.float32)
     return Calibration(
-        (Psf(pixels),), Sensor(BLACK_DN, sensor.gain_e, sensor.read_e, float(2**sensor.bits - 1)),
-        OPTICS.geometry(sensor.pitch_um), FIELD_DEG, simulated=True,
-    )  # fmt: skip
+        (Psf(pixels),),
+        Sensor(BLACK_DN, sensor.gain_e, sensor.read_e, float(2**sensor.bits - 1)),
+        OPTICS.geometry(sensor.pitch_um),
+        FIELD_DEG,
+        simulated=True,
+    )
 
 
 CHANNEL_PLANE: dict[Colour, int] = {"red": 0, "green": 1, "blue": 2}

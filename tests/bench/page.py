@@ -115,9 +115,12 @@ def without_a_step_ms(noted: list[Mark]) -> float:
 
 PARTS = ("tap", "post", "expose", "quick", "fetched", "shown quick")
 NAMES = {
-    "tap": "  tap to request", "post": "  request to exposure", "expose": "  frames to quick look, without exposure",
-    "quick": "  word of it to its bytes", "fetched": "  bytes to screen",
-}  # fmt: skip
+    "tap": "  tap to request",
+    "post": "  request to exposure",
+    "expose": "  frames to quick look, without exposure",
+    "quick": "  word of it to its bytes",
+    "fetched": "  bytes to screen",
+}
 
 
 def quick_looks(browser: Browser, url: str) -> None:

@@ -28,9 +28,14 @@ from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degr
 from tests.textbook.propagation import Optics, Plane, Prescription, caustic, diffuser
 
 PHOTOGRAPHS = (
-    "skimage/retina.jpg", "hrf/images/06_dr.JPG", "hrf/images/07_h.jpg", "hrf/images/09_g.jpg",
-    "chase/Image_01L.jpg", "chase/Image_05R.jpg", "chase/Image_11L.jpg",
-)  # fmt: skip
+    "skimage/retina.jpg",
+    "hrf/images/06_dr.JPG",
+    "hrf/images/07_h.jpg",
+    "hrf/images/09_g.jpg",
+    "chase/Image_01L.jpg",
+    "chase/Image_05R.jpg",
+    "chase/Image_11L.jpg",
+)
 IMX296 = Camera((1088, 1456), 10000.0, 2.2, 10, 60.0)
 QUANTALUX = Camera((1080, 1920), 23000.0, 1.0, 12, 64.0)
 PITCH_UM = {IMX296: 3.45, QUANTALUX: 5.04}
@@ -71,17 +76,23 @@ def cases(
     rng = np.random.default_rng((seed, *name.encode(), camera.bits, round(10 * field_deg), round(10 * cylinder_dpt)))
     for k in range(count):
         deviations = (
-            FieldEdge(field_deg - 0.2), FieldEdge(field_deg + 0.1), off_centre(field_deg, rng),
+            FieldEdge(field_deg - 0.2),
+            FieldEdge(field_deg + 0.1),
+            off_centre(field_deg, rng),
             FieldEdge(field_deg, width_deg=float(rng.uniform(0.3, 2))),
-        )  # fmt: skip
+        )
         turned = bool(rng.integers(2))  # the photograph's own round border is outside the field, or on it
         yield Case(
-            camera, field_deg, FieldEdge(field_deg) if k % 2 else deviations[k // 2 % 4],
+            camera,
+            field_deg,
+            FieldEdge(field_deg) if k % 2 else deviations[k // 2 % 4],
             (float(rng.uniform(-6, 6)), *(float(j) for j in rng.uniform(-cylinder_dpt, cylinder_dpt, 2))),
-            PHOTOGRAPHS[int(rng.integers(len(PHOTOGRAPHS)))], 1.0 if rng.random() < 2 / 3 else 0.2,
-            int(rng.integers(2**31)), float(rng.uniform(1.15, 1.6)) if turned else 1.0,
+            PHOTOGRAPHS[int(rng.integers(len(PHOTOGRAPHS)))],
+            1.0 if rng.random() < 2 / 3 else 0.2,
+            int(rng.integers(2**31)),
+            float(rng.uniform(1.15, 1.6)) if turned else 1.0,
             float(rng.uniform(0, 360)) if turned else 0.0,
-        )  # fmt: skip
+        )
 
 
 def off_centre(field_deg: float, rng: np.random.Generator) -> FieldEdge:
@@ -179,23 +190,28 @@ class Limits:
 def summarise(title: str, scored: list[Scored], k: int, limits: Limits) -> bool:
     """Print the figures of one component of one group beside its lines; return True if all hold."""
     known = [one for one in scored if one.refused is None]
-    error, sd = (np.array([values[k] for values in column]) for column in (
-        [one.errors_dpt for one in known], [one.sds_dpt for one in known]
-    ))  # fmt: skip
+    error, sd = (
+        np.array([values[k] for values in column])
+        for column in ([one.errors_dpt for one in known], [one.sds_dpt for one in known])
+    )
     z = np.abs(error / sd)
     rms, median_sd, refused = float(np.sqrt(np.mean(error**2))), float(np.median(sd)), 1 - len(known) / len(scored)
     within, near = float(np.mean(z < 2)), float(np.mean(z < 1))
     holds = (
-        rms <= limits.rms_dpt and median_sd <= limits.sd_dpt and refused <= 0.1
-        and 0.93 <= within <= 0.99 and 0.62 <= near <= 0.76
-    )  # fmt: skip
+        rms <= limits.rms_dpt
+        and median_sd <= limits.sd_dpt
+        and refused <= 0.1
+        and 0.93 <= within <= 0.99
+        and 0.62 <= near <= 0.76
+    )
     print(
         f"{'ok  ' if holds else 'MISS'} {title}: {len(scored)} frames, RMS {rms:.3f} (at most {limits.rms_dpt:g}), "
         f"mean {error.mean():+.3f}, below 2 sd {within:.0%} (93 to 99), below 1 sd {near:.0%} (62 to 76), "
         f"refused {refused:.0%} (at most 10), median sd {median_sd:.3f} (at most {limits.sd_dpt:g}), "
         f"rms z {float(np.sqrt(np.mean(z**2))):.2f}, beyond 3 sd {int((z > 3).sum())}, "
-        f"interval score {interval_score(error, sd):.2f} dpt", flush=True,
-    )  # fmt: skip
+        f"interval score {interval_score(error, sd):.2f} dpt",
+        flush=True,
+    )
     return holds
 
 
@@ -209,9 +225,10 @@ def tabulate(scored: list[Scored]) -> None:
     print("| by | value | frames | refused | RMS M, dpt | below 1 sd | below 2 sd |\n|---|---|---|---|---|---|---|")
     for (by, value), ones in sorted(cells.items()):
         known = [one for one in ones if one.refused is None]
-        error, sd = (np.array([column[0] for column in columns]) for columns in (
-            [one.errors_dpt for one in known], [one.sds_dpt for one in known]
-        ))  # fmt: skip
+        error, sd = (
+            np.array([column[0] for column in columns])
+            for columns in ([one.errors_dpt for one in known], [one.sds_dpt for one in known])
+        )
         shares = [f"{np.mean(np.abs(error) < k * sd):.0%}" if known else "-" for k in (1, 2)]
         rms = f"{np.sqrt(np.mean(error**2)):.3f}" if known else "-"
         print(f"| {by} | {value} | {len(ones)} | {len(ones) - len(known)} | {rms} | {' | '.join(shares)} |", flush=True)
@@ -292,11 +309,15 @@ def faults(seed: int, count: int, data: Path) -> Iterator[tuple[str, Scored]]:
         head = head_of(case)
         own = calibrated(IMX296, 33.4, head)
         scenes = {
-            "uniform field": field, "empty disc": field * 1e-3 + 1, "open scene, no edge": retina * whole,
-            "half a lid": retina * field * np.where(down_deg < 0, 0.08, 1.0), "two discs": retina * (field + second),
-            "stray ring": retina * field + 0.5 * ring, "elliptical edge": retina * oval,
+            "uniform field": field,
+            "empty disc": field * 1e-3 + 1,
+            "open scene, no edge": retina * whole,
+            "half a lid": retina * field * np.where(down_deg < 0, 0.08, 1.0),
+            "two discs": retina * (field + second),
+            "stray ring": retina * field + 0.5 * ring,
+            "elliptical edge": retina * oval,
             "disc 1 deg off": retina * decentred,
-        }  # fmt: skip
+        }
         for kind, scene in scenes.items():
             yield kind, scored(case, expose(case, scene), own)
         lit = retina * field
@@ -320,8 +341,9 @@ def judge_faults(seed: int, count: int, data: Path) -> bool:
     holds = beyond[0] <= 1 and beyond[1] == 0
     print(
         f"{'ok  ' if holds else 'MISS'} faults: {len(z) + refused} frames, {refused} refused, {beyond[0]} beyond 3 sd "
-        f"(at most 1), {beyond[1]} beyond 4 sd (none)", flush=True,
-    )  # fmt: skip
+        f"(at most 1), {beyond[1]} beyond 4 sd (none)",
+        flush=True,
+    )
     return holds
 
 
@@ -374,13 +396,14 @@ def judge_pictures(seed: int, data: Path) -> bool:
             cylinder_dpt = -2 * float(np.hypot(*case.eye[1:]))
             found.setdefault((round(cylinder_dpt, 1), case.light), []).append(picture_gain(case, data))
         for (cylinder_dpt, light), pairs in found.items():
-            measured, predicted = (" ".join("   -" if one is None else f"{one:+.2f}" for one in part) for part in zip(
-                *pairs, strict=True
-            ))  # fmt: skip
+            measured, predicted = (
+                " ".join("   -" if one is None else f"{one:+.2f}" for one in part) for part in zip(*pairs, strict=True)
+            )
             print(
                 f"{camera.bits} bit {field_deg:g} deg, cylinder {cylinder_dpt:+.0f} dpt, light {light:g}: gain "
-                f"{measured} dB, predicted {predicted}", flush=True,
-            )  # fmt: skip
+                f"{measured} dB, predicted {predicted}",
+                flush=True,
+            )
             gains_db += [gain for gain, _ in pairs if cylinder_dpt == CYLINDERS_DPT[2]]
     mean_db = float(np.mean(gains_db))
     holds = mean_db >= LEAST_GAIN_DB
@@ -431,8 +454,9 @@ def judge_bursts(seed: int, count: int, data: Path) -> bool:
                     f"{name} light {case.light:g}: error of the first {-first.sphere_dpt - spheres_dpt[0]:+.3f} (sd "
                     f"{first.sd_dpt:.3f}), of the burst {-whole.sphere_dpt - spheres_dpt.mean():+.3f} (sd "
                     f"{whole.sd_dpt:.3f}) dpt; scatter true {np.std(spheres_dpt, ddof=1):.3f}, found "
-                    f"{whole.scatter.sd_dpt:.3f} dpt, chi2 {whole.scatter.chi2:.1f}", flush=True,
-                )  # fmt: skip
+                    f"{whole.scatter.sd_dpt:.3f} dpt, chi2 {whole.scatter.chi2:.1f}",
+                    flush=True,
+                )
     share = float(np.mean(alarms))
     holds = share <= MOST_ALARMS
     print(
@@ -467,10 +491,11 @@ def times_s(case: Case, planner: Planner, data: Path) -> tuple[float, float, flo
     whole = estimator.add_cylinder(found)  # compiles
     assert isinstance(whole, Refraction), whole.reason
     return (
-        processor_s(lambda: (pair.forward(), pair.inverse())), processor_s(lambda: estimator.find(counts)),
+        processor_s(lambda: (pair.forward(), pair.inverse())),
+        processor_s(lambda: estimator.find(counts)),
         processor_s(lambda: estimator.add_cylinder(found)),
         processor_s(lambda: estimator.join(whole, [counts] * BURST, None)) / BURST,
-    )  # fmt: skip
+    )
 
 
 def judge_times(seed: int, data: Path) -> bool:

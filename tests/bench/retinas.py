@@ -24,10 +24,14 @@ from tests.bench.peer_environment import lensless_pictures
 
 HEAD = load_head(Path("hardware/heads/sim.toml"))
 PHOTOGRAPHS = {
-    "cc0": "skimage/retina.jpg", "06_dr": "hrf/images/06_dr.JPG", "07_h": "hrf/images/07_h.jpg",
-    "09_g": "hrf/images/09_g.jpg", "01L": "chase/Image_01L.jpg", "05R": "chase/Image_05R.jpg",
+    "cc0": "skimage/retina.jpg",
+    "06_dr": "hrf/images/06_dr.JPG",
+    "07_h": "hrf/images/07_h.jpg",
+    "09_g": "hrf/images/09_g.jpg",
+    "01L": "chase/Image_01L.jpg",
+    "05R": "chase/Image_05R.jpg",
     "11L": "chase/Image_11L.jpg",
-}  # fmt: skip
+}
 FOUR = ("cc0", "06_dr", "07_h", "01L")
 IMX296 = {"rows": 1088, "cols": 1456, "pitch_um": 3.45, "full_well_e": 23000.0, "read_noise_e": 2.2}
 MUS = 10.0 ** np.arange(-6.5, -1.9, 0.25)
@@ -201,9 +205,11 @@ def main() -> None:
 
 
 PARTS = {
-    "retinas": (retinas, "fundus"), "sensors": (sensors, "fundus"),
-    "refraction": (refraction, "fundus"), "dlmd": (dlmd, "lensless"),
-}  # fmt: skip
+    "retinas": (retinas, "fundus"),
+    "sensors": (sensors, "fundus"),
+    "refraction": (refraction, "fundus"),
+    "dlmd": (dlmd, "lensless"),
+}
 
 if __name__ == "__main__":
     main()

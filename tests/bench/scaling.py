@@ -74,12 +74,16 @@ def drawn(found: list[dict[str, float]]) -> str:
     """Return the plot of time over sensor size, both logarithmic."""
     trails = {
         case: tuple(
-            Mark(at["pixels"] / 1e6, at[case] / 1e3, f"{at['peak_mb']:.0f} MB" if case == "bin 1" else "",
-                 f"{at['pixels'] / 1e6:.2f} megapixels, {case}: {at[case]:.1f} ms")
+            Mark(
+                at["pixels"] / 1e6,
+                at[case] / 1e3,
+                f"{at['peak_mb']:.0f} MB" if case == "bin 1" else "",
+                f"{at['pixels'] / 1e6:.2f} megapixels, {case}: {at[case]:.1f} ms",
+            )
             for at in found
         )
         for case in ("bin 1", "bin 2")
-    }  # fmt: skip
+    }
     series = tuple(Series(f"gradient, {case}", (marks,)) for case, marks in trails.items())
     x = log_axis([at["pixels"] / 1e6 for at in found], "sensor, megapixels", lambda value: f"{value:g}")
     y = time_axis([mark.y for own in trails.values() for mark in own], "time from counts in memory to the picture")

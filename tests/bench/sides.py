@@ -55,9 +55,13 @@ PHOTOS = (
     Photo("chase/Image_11L.jpg", "OS", 32.2, (0.546, 0.430), None),
 )
 CONDITIONS: dict[str, tuple[float, float, float]] = {  # blur in degrees, light, field in degrees
-    "as it is": (0.0, 1.0, 33.4), "blurred 0.3 deg": (0.3, 1.0, 33.4), "blurred 1 deg": (1.0, 1.0, 33.4),
-    "a tenth of the light": (0.0, 0.1, 33.4), "a fiftieth": (0.0, 0.02, 33.4), "45 deg": (0.0, 1.0, 45.0),
-}  # fmt: skip
+    "as it is": (0.0, 1.0, 33.4),
+    "blurred 0.3 deg": (0.3, 1.0, 33.4),
+    "blurred 1 deg": (1.0, 1.0, 33.4),
+    "a tenth of the light": (0.0, 0.1, 33.4),
+    "a fiftieth": (0.0, 0.02, 33.4),
+    "45 deg": (0.0, 1.0, 45.0),
+}
 
 
 def prepared(photo: Photo, data: Path, mirrored: bool, turned_deg: float, blur_deg: float, aim: str, to: Path) -> Eye:
@@ -93,10 +97,12 @@ class Maker:
         looked = with_keys(HEAD, peak_e=HEAD.sim.peak_e * light)
         assert looked.sim is not None
         thing = ObjectSpec(kind="image", image=image, size_deg=wide_deg)
-        spec: InstrumentSpec = looked.model_copy(update={
-            "sim": looked.sim.model_copy(update={"object": thing}),
-            "optics": HEAD.optics.model_copy(update={"field_deg": field_deg}),
-        })  # fmt: skip
+        spec: InstrumentSpec = looked.model_copy(
+            update={
+                "sim": looked.sim.model_copy(update={"object": thing}),
+                "optics": HEAD.optics.model_copy(update={"field_deg": field_deg}),
+            }
+        )
         shot = simulate_exposure(spec)
         if field_deg not in self._made:
             self._made[field_deg] = Reconstructor(shot.calibration, shot.counts.shape, PLANNER, CLOCK)

@@ -157,8 +157,12 @@ class Board:
         """Run a command as root on the board and return its output, with errors; AssertionError if it fails."""
         done = subprocess.run(
             ["ssh", *self._login(), "-p", str(self._ssh_port), "root@127.0.0.1", *words],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=limit_s, check=False,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=limit_s,
+            check=False,
+        )
         assert done.returncode == 0 or not check, f"{' '.join(words)}: {done.stdout}"
         return done.stdout
 
@@ -218,14 +222,38 @@ class Board:
         line = self.card.text(self.booted, f"cmdline-{self.booted[-1]}.txt").strip()
         net = f"user,id=net0,hostfwd=tcp:127.0.0.1:{self._ssh_port}-:22"
         words = [
-            *BOARDS[self.arch], "-smp", str(CORES), "-m", str(MEMORY_MB), "-accel", "tcg,thread=multi,tb-size=1024",
-            "-kernel", str(kernel), "-initrd", str(initrd), "-append", f"{line} console={CONSOLES[self.arch]}",
-            *_drive(self.card.image, "card"), "-device", "virtio-blk-pci,drive=card",
-            "-netdev", net, "-device", "virtio-net-pci,netdev=net0", "-device", "qemu-xhci",
-            "-device", "virtio-rng-pci", "-display", "none", "-no-reboot",
-            "-serial", f"file:{self.folder / f'console-{self.boots}'}",
-            "-monitor", f"unix:{self.folder / 'monitor'},server,nowait",
-        ]  # fmt: skip
+            *BOARDS[self.arch],
+            "-smp",
+            str(CORES),
+            "-m",
+            str(MEMORY_MB),
+            "-accel",
+            "tcg,thread=multi,tb-size=1024",
+            "-kernel",
+            str(kernel),
+            "-initrd",
+            str(initrd),
+            "-append",
+            f"{line} console={CONSOLES[self.arch]}",
+            *_drive(self.card.image, "card"),
+            "-device",
+            "virtio-blk-pci,drive=card",
+            "-netdev",
+            net,
+            "-device",
+            "virtio-net-pci,netdev=net0",
+            "-device",
+            "qemu-xhci",
+            "-device",
+            "virtio-rng-pci",
+            "-display",
+            "none",
+            "-no-reboot",
+            "-serial",
+            f"file:{self.folder / f'console-{self.boots}'}",
+            "-monitor",
+            f"unix:{self.folder / 'monitor'},server,nowait",
+        ]
         return words + (["-dtb", str(self._device_tree())] if self.arch == "arm64" else [])
 
     def _device_tree(self) -> Path:

@@ -56,9 +56,16 @@ def opened(path: Path) -> str:
 def frame() -> dict[str, Any]:
     """Return shape and number of different counts of one frame of /dev/video0."""
     spec = CameraSpec(
-        backend="v4l2", rows=ROWS, cols=COLS, pitch_um=3.0, bit_depth=16, full_well_e=1e4, read_noise_e=1.0,
-        black_dn=0.0, exposure_s=0.02,
-    )  # fmt: skip
+        backend="v4l2",
+        rows=ROWS,
+        cols=COLS,
+        pitch_um=3.0,
+        bit_depth=16,
+        full_well_e=1e4,
+        read_noise_e=1.0,
+        black_dn=0.0,
+        exposure_s=0.02,
+    )
     camera = V4l2Camera(spec, NoLight(), SystemClock(), transport=WithExposure(), patience_s=60.0)
     try:
         counts = camera.expose(ExposureSettings(spec.exposure_s)).counts

@@ -38,8 +38,12 @@ def sections(camera: Camera, server: Server) -> None:
     if page.locator("#overview").count():  # result of a calibration that this browser has not dismissed
         camera.tap("#overview")
     camera.take("calibration", "[data-view=overview]")
-    for room, ready in (("health", "li[data-check]"), ("explorer", "accuracy-time svg"), ("diary", ".diary li"),
-                        ("update", ".update")):  # fmt: skip
+    for room, ready in (
+        ("health", "li[data-check]"),
+        ("explorer", "accuracy-time svg"),
+        ("diary", ".diary li"),
+        ("update", ".update"),
+    ):
         open_section(page, room)
         camera.take(room, ready)
         page.screenshot(path=camera.folder / f"{room}-whole.png", full_page=True)

@@ -142,20 +142,28 @@ class Real:
     """
 
     def __init__(
-        self, folder: Path, plans: Path, weeks_old: float = 0.0, uploads: dict[str, object] | None = None,
-        binning: int = BINNING, **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        plans: Path,
+        weeks_old: float = 0.0,
+        uploads: dict[str, object] | None = None,
+        binning: int = BINNING,
+        **options: Any,
+    ) -> None:
         self.clock, self.free_space, self.event_bus = MovableClock(), Disk(), HoldingBus()
         self.free_space.bus = self.event_bus
         self.stick, self._mounts, self._undo = folder / "media" / "USB STICK", folder / "mounts", ExitStack()
         self.unmount()
         made = self.clock.wall() - timedelta(weeks=weeks_old)
         parts: dict[str, Any] = {
-            "head": lambda head: with_all_chips(head, made), "store": {"free_bytes": self.free_space},
-            "clock": self.clock, "event_bus": self.event_bus, "wait": False,
+            "head": lambda head: with_all_chips(head, made),
+            "store": {"free_bytes": self.free_space},
+            "clock": self.clock,
+            "event_bus": self.event_bus,
+            "wait": False,
             "sticks": UsbDrives((folder / "media",), self._mounts),
             "carrier": uploads and HttpsUploader(UploadSettings.model_validate(uploads)),
-        }  # fmt: skip
+        }
         self.rig: Rig = rig_builder(small_template(binning), plans)(folder, self._undo, **parts | options)
         self._serve(self.rig)
 

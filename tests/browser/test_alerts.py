@@ -44,8 +44,18 @@ BLOCKING = {
     "consent.declined": "Did not agree",
     "light.limit": r"Rest this eye – \d+:\d\d",  # the last: its cause is hours old
 }
-ADVISORY = ["camera.stalled", "power.lost", "batt.low", "store.low", "clock.wrong", "send.stuck", "make.slow",
-            "heat.warm", "send.waiting", "cal.old"]  # fmt: skip
+ADVISORY = [
+    "camera.stalled",
+    "power.lost",
+    "batt.low",
+    "store.low",
+    "clock.wrong",
+    "send.stuck",
+    "make.slow",
+    "heat.warm",
+    "send.waiting",
+    "cal.old",
+]
 
 
 def test_alert_table_matches_specification() -> None:

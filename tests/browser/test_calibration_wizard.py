@@ -39,16 +39,22 @@ LENS_TABLES = TABLES.replace("[sim]\n", "[sim]\npeak_e = 690000\ncalibration = {
 )
 LENS_HEAD = (
     small_head_toml("Head for lenses", LENS_TABLES, exposure_s=0.005)
-    .replace("rows = 270", "rows = 158").replace("cols = 480", "cols = 282").replace("20.16", "34.27")
+    .replace("rows = 270", "rows = 158")
+    .replace("cols = 480", "cols = 282")
+    .replace("20.16", "34.27")
     .replace("full_well_e = 23000", "full_well_e = 1060000\nbit_depth = 16")
     .replace('backend = "sim"\n\n[optics]', 'backend = "sim"\npreview_colour = "green"\n\n[optics]')
-)  # fmt: skip
+)
 SHAPES = [SIZES["tablet"], SIZES["portrait"], SIZES["phone"]]
 # Network errors while the server is killed.
 CUT = (
-    "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_INCOMPLETE_CHUNKED", "ERR_EMPTY_RESPONSE", "ERR_SOCKET",
+    "ERR_CONNECTION_REFUSED",
+    "ERR_CONNECTION_RESET",
+    "ERR_INCOMPLETE_CHUNKED",
+    "ERR_EMPTY_RESPONSE",
+    "ERR_SOCKET",
     "ERR_CONTENT_LENGTH_MISMATCH",
-)  # fmt: skip
+)
 WORDS = {"cap": "The cap is on", "screen": "The screen is there", "point": "The point is there"}
 Open = Callable[..., Page]
 

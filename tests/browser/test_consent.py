@@ -100,5 +100,9 @@ def test_visit_is_copied_to_usb_drive(open_page: Open, real: Real) -> None:
     (folder,) = real.stick.iterdir()
     assert folder.name == f"{visit['number']}-{visit['id']}"
     assert {path.name for path in folder.iterdir()} == {
-        "R-centre-1.png", "R-centre-1-colour.png", "R-centre-1.json", "visit.json", "SHA256SUMS",
-    }  # fmt: skip
+        "R-centre-1.png",
+        "R-centre-1-colour.png",
+        "R-centre-1.json",
+        "visit.json",
+        "SHA256SUMS",
+    }

@@ -95,9 +95,9 @@ def test_full_storage_during_visit_keeps_captures(open_page: Open, real: Real) -
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", re.compile("good|poor"))
     after_debounce(page).locator(SHUTTER).tap(force=True)
     assert real.rig.store.captures() == kept
-    real.free_space.free_bytes = sum(
-        path.stat().st_size for path in (real.rig.store.folder / "captures" / kept[0].id).iterdir()
-    ) * 30  # fmt: skip
+    real.free_space.free_bytes = (
+        sum(path.stat().st_size for path in (real.rig.store.folder / "captures" / kept[0].id).iterdir()) * 30
+    )
     expect_ended(page, "store.full")
     expect_chip(page, "store.low", r"Space for \d+ more")
     real.free_space.free_bytes = MOST_BYTES

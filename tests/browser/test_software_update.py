@@ -184,9 +184,16 @@ def test_every_update_state_and_error_fits(device: Device, open_page: Open, comp
     page.route("**/api/outbox", lambda route: route.fulfill(json={"waiting": 3}))
     boot = boot_id()
     stages = {
-        "looking": {}, "fetching": {"share": 0.4}, "installing": {"share": 0.8}, "installed": {}, "trying": {},
-        "committed": {"version": device.version}, "went back": {}, "refused": {}, "interrupted": {},
-    }  # fmt: skip
+        "looking": {},
+        "fetching": {"share": 0.4},
+        "installing": {"share": 0.8},
+        "installed": {},
+        "trying": {},
+        "committed": {"version": device.version},
+        "went back": {},
+        "refused": {},
+        "interrupted": {},
+    }
     for state, more in stages.items():
         entry = {"state": state, "version": "3.0", "before": "2.0", "boot": boot} | more
         write_state(device.board.state, UpdateState.model_validate(entry))

@@ -28,8 +28,13 @@ POINTS = [
     {"method": "variation", "bin": 2, "rounds": 8, "seconds_median": 0.090, "psnr_db": 31.5, "pareto": True},
     {"method": "open", "bin": 2, "rounds": 8, "seconds_median": 0.300, "psnr_db": 32.0, "pareto": True},
 ]  # the last one is for an unknown field: it is not shown
-MEASURED = {"scene": "A scene", "measured_at": "2026-11-01T09:30:00+00:00", "budget_s": 0.26,
-            "region": {"field_known": True}, "points": POINTS}  # fmt: skip
+MEASURED = {
+    "scene": "A scene",
+    "measured_at": "2026-11-01T09:30:00+00:00",
+    "budget_s": 0.26,
+    "region": {"field_known": True},
+    "points": POINTS,
+}
 
 
 @pytest.fixture(scope="module")

@@ -119,8 +119,15 @@ def test_new_patient_needs_three_taps_and_no_typing(open_page: Open, real: Real)
     page.locator("[data-field=complaints] [data-value=flashes]").tap()
     page.locator("[data-field=complaints] [data-value=none]").tap()
     expect(page.locator("h1")).to_have_text("A0001-3 · Woman, 54")
-    answers = {"consent": "agreed", "sex": "woman", "diabetes": "yes", "diabetes_years": ">10", "vision_os": "CF",
-               "age": 54, "complaints": ["none"]}  # fmt: skip
+    answers = {
+        "consent": "agreed",
+        "sex": "woman",
+        "diabetes": "yes",
+        "diabetes_years": ">10",
+        "vision_os": "CF",
+        "age": 54,
+        "complaints": ["none"],
+    }
     until(lambda: real.visit()["fields"] == answers)  # the last answer may still be on its way
     expect(page.locator("#unsaved")).to_be_empty()
 

@@ -324,11 +324,24 @@ def lamp_lost(stage: Stage) -> None:
 SCENARIOS: dict[str, Callable[[Stage], None]] = {
     one.__name__: one
     for one in (
-        press, press_while_aiming, aiming_ends, press_during_refinement, repeated_press, cancel, withdrawn,
-        camera_lost, camera_stalled, camera_pulled, light_fault, light_cut, sigterm_during_exposure,
-        sigterm_while_aiming, head_lost, lamp_lost,
+        press,
+        press_while_aiming,
+        aiming_ends,
+        press_during_refinement,
+        repeated_press,
+        cancel,
+        withdrawn,
+        camera_lost,
+        camera_stalled,
+        camera_pulled,
+        light_fault,
+        light_cut,
+        sigterm_during_exposure,
+        sigterm_while_aiming,
+        head_lost,
+        lamp_lost,
     )
-}  # fmt: skip
+}
 LIMITS = {"light_cut": {"max_on_s": 0.15}}  # other arguments of the instrument
 
 

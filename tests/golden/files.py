@@ -191,12 +191,17 @@ def read_data(folder: Path) -> dict[str, Any]:
 def _read_store(store: CaptureStore) -> dict[str, Any]:
     kept = [
         {
-            "id": one.id, "eye": one.eye, "taken_at": one.taken_at.isoformat(), "simulated": one.simulated,
-            "calibration": one.calibration_id, "report": report_as_json(one.report), "files": dict(one.files),
+            "id": one.id,
+            "eye": one.eye,
+            "taken_at": one.taken_at.isoformat(),
+            "simulated": one.simulated,
+            "calibration": one.calibration_id,
+            "report": report_as_json(one.report),
+            "files": dict(one.files),
             "sizes": {name: len(store.read(one.id, name)) for name in one.files},
         }
         for one in store.captures()
-    ]  # fmt: skip
+    ]
     return {
         "captures": kept,
         "damaged": store.damaged(),
@@ -224,12 +229,18 @@ def _read_uploads(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
     outbox = UploadQueue(store.engine, clock)
     waiting = [
         {
-            "visit": one.visit, "number": one.number, "finished_at": one.finished_at.isoformat(), "tries": one.tries,
-            "failing_since": one.failing_since and one.failing_since.isoformat(), "error": one.error,
-            "said": one.message, "stuck": one.stuck, "size_bytes": one.size_bytes,
+            "visit": one.visit,
+            "number": one.number,
+            "finished_at": one.finished_at.isoformat(),
+            "tries": one.tries,
+            "failing_since": one.failing_since and one.failing_since.isoformat(),
+            "error": one.error,
+            "said": one.message,
+            "stuck": one.stuck,
+            "size_bytes": one.size_bytes,
         }
         for one in outbox.queued(sizes=True)
-    ]  # fmt: skip
+    ]
     trouble = outbox.status()
     return {"waiting": waiting, "numbers": [trouble.waiting, trouble.stuck, trouble.failing]}
 
@@ -252,9 +263,11 @@ def _read_settings(folder: Path, clock: VirtualClock) -> dict[str, Any]:
     chosen = AccuracyExplorer(folder / "data" / "explorer", folder, clock, spec, lambda *_, **__: None, measure_scene)
     send = load_settings(folder / "send.toml")
     return {
-        "wrong pin": refused, "pace": chosen.pace, "budget_s": chosen.budget_s,
+        "wrong pin": refused,
+        "pace": chosen.pace,
+        "budget_s": chosen.budget_s,
         "send": {"address": send.address, "token": str(send.token), "answer_s": send.answer_s, "most_s": send.most_s},
-    }  # fmt: skip
+    }
 
 
 def _read_calibrations(folder: Path) -> dict[str, Any]:
@@ -265,11 +278,15 @@ def _read_calibrations(folder: Path) -> dict[str, Any]:
         found[id] = {
             "psfs": [[psf.name, psf.colour, digest(psf.pixels.tobytes())] for psf in kept.calibration.psfs],
             "maps": {name: digest(pixels.tobytes()) for name, pixels in maps.items()},
-            "serial": kept.provenance.serial, "made_by": kept.provenance.made_by,
-            "made_at": kept.provenance.made_at.isoformat(), "temperature_c": kept.provenance.temperature_c,
-            "figures": [list(one) for one in kept.provenance.figures], "field_deg": kept.calibration.field_deg,
-            "black_dn": kept.calibration.sensor.black_dn, "pitch_um": kept.calibration.geometry.pitch_um,
-        }  # fmt: skip
+            "serial": kept.provenance.serial,
+            "made_by": kept.provenance.made_by,
+            "made_at": kept.provenance.made_at.isoformat(),
+            "temperature_c": kept.provenance.temperature_c,
+            "figures": [list(one) for one in kept.provenance.figures],
+            "field_deg": kept.calibration.field_deg,
+            "black_dn": kept.calibration.sensor.black_dn,
+            "pitch_um": kept.calibration.geometry.pitch_um,
+        }
     files, signer = read_export(folder / "sent.calibration", (read_signer(folder / "key.pub"),))
     signed = {"files": {name: digest(content) for name, content in files.items()}, "signer": signer.name}
     return {"kept": found, "in force": archive.active_id(), "signed": signed}

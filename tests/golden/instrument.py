@@ -190,10 +190,19 @@ async def _followed(app: FastAPI, enough: Heard, after: int | None) -> list[dict
             done.set()
 
     scope = {
-        "type": "http", "asgi": {"version": "3.0", "spec_version": "2.3"}, "http_version": "1.1", "method": "GET",
-        "scheme": "http", "path": "/api/events", "raw_path": b"/api/events", "query_string": b"", "root_path": "",
-        "headers": [(b"host", b"eye.local"), *last], "server": ("eye.local", 80), "client": ("page", 1),
-    }  # fmt: skip
+        "type": "http",
+        "asgi": {"version": "3.0", "spec_version": "2.3"},
+        "http_version": "1.1",
+        "method": "GET",
+        "scheme": "http",
+        "path": "/api/events",
+        "raw_path": b"/api/events",
+        "query_string": b"",
+        "root_path": "",
+        "headers": [(b"host", b"eye.local"), *last],
+        "server": ("eye.local", 80),
+        "client": ("page", 1),
+    }
     await asyncio.wait_for(app(scope, receive, send), 60)
     return heard
 
@@ -263,9 +272,15 @@ def _owner(
         head: Head = open_head(with_calibration(spec, root), clock, book)
         cameras.append(BreakableCamera(head.camera))
         return ExamService(
-            replace(head, camera=cameras[-1]), store, bulletin, clock, plans, house.on_failure, Watchdog(None),
+            replace(head, camera=cameras[-1]),
+            store,
+            bulletin,
+            clock,
+            plans,
+            house.on_failure,
+            Watchdog(None),
             lambda: explorer.budget_s,
-        )  # fmt: skip
+        )
 
     def bench() -> Bench:
         benches.append(opened := open_bench(spec, clock))

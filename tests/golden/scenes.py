@@ -50,10 +50,13 @@ def figures(array: np.ndarray) -> dict[str, Any]:
     values /= values.mean()
     bands = [block for band in np.array_split(values, BLOCKS) for block in np.array_split(band, BLOCKS, axis=1)]
     return {
-        "shape": list(array.shape), "dtype": str(array.dtype), "max": _rounded(array.max()),
-        "max_to_mean": _rounded(values.max()), "sd_to_mean": _rounded(values.std()),
+        "shape": list(array.shape),
+        "dtype": str(array.dtype),
+        "max": _rounded(array.max()),
+        "max_to_mean": _rounded(values.max()),
+        "sd_to_mean": _rounded(values.std()),
         "blocks_to_mean": [_rounded(block.mean()) for block in bands],
-    }  # fmt: skip
+    }
 
 
 def _rounded(value: float) -> float:

@@ -7,9 +7,13 @@ import pytest
 from tests.golden import compare, http_transcript
 
 ALWAYS = {  # public operations without input: the only refusal is that of a foreign host name
-    "GET /api/status", "GET /api/health", "GET /api/protocol", "GET /api/exports", "GET /api/outbox",
+    "GET /api/status",
+    "GET /api/health",
+    "GET /api/protocol",
+    "GET /api/exports",
+    "GET /api/outbox",
     "GET /api/technician",
-}  # fmt: skip
+}
 
 
 PROSE = {"description", "summary", "title", "operationId"}

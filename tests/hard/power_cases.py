@@ -38,7 +38,7 @@ from tests.hard.power_fat import (
     judge_rename,
     with_choice,
     with_stick,
-)  # fmt: skip
+)
 from tests.unit.test_archive import WHO, calibration
 
 OLD, NEW = (replace(calibration(black_dn), dark_dn=None, bad=None) for black_dn in (64.25, 65.0))

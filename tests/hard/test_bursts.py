@@ -109,9 +109,11 @@ def test_displaced_frames_leave_no_gap_where_most_of_them_see_the_retina(
 def test_a_useless_frame_changes_nothing(join: BurstJoiner, within: Within, spoil: str) -> None:
     good = [frame(seen(RETINA, at), 5000, k) for k, at in enumerate(DRIFT_PX[:3])]
     bad = {
-        "dark": np.full(SHAPE, BLACK_DN), "saturated": np.full(SHAPE, 4095.0), "NaN": np.full(SHAPE, np.nan),
+        "dark": np.full(SHAPE, BLACK_DN),
+        "saturated": np.full(SHAPE, 4095.0),
+        "NaN": np.full(SHAPE, np.nan),
         "noise": np.random.default_rng(3).uniform(BLACK_DN, 700, SHAPE),
-    }[spoil].astype(np.float32)  # fmt: skip
+    }[spoil].astype(np.float32)
     alone, mixed = join(good), join([*good[:2], bad, good[2]])
     assert [use.used for use in mixed.frames] == [True, True, False, True]
     assert mixed.frames[2].reason

@@ -58,39 +58,56 @@ def eye(**keys: Any) -> dict[str, Any]:
 
 
 GOOD: list[tuple[str, dict[str, Any], float]] = [
-    *((name, {}, 1.0) for name in (
-        "calm", "dim", "healthy", "diabetic", "short_sighted", "small_pupil", "stray_light", "worn_sensor",
-        "drifting_eye",
-    )),
+    *(
+        (name, {}, 1.0)
+        for name in (
+            "calm",
+            "dim",
+            "healthy",
+            "diabetic",
+            "short_sighted",
+            "small_pupil",
+            "stray_light",
+            "worn_sensor",
+            "drifting_eye",
+        )
+    ),
     *((name, eye(m_dpt=m_dpt), 1.0) for name in ("calm", "dim") for m_dpt in (-8.0, -4.0, -1.5, 1.5, 4.0, 8.0)),
     *((name, {"eye": {"gaze_deg": gaze}}, 1.0) for name in ("calm", "dim") for gaze in ((5.0, 0.0), (0.0, -5.0))),
     *(("calm", eye(drift_deg_per_s=speed), 1.0) for speed in (1.0, 3.0, 5.0)),
-    ("calm", eye(pupil_um=2500.0), 1.0), ("calm", eye(axial_um=4000.0), 1.0), ("calm", eye(axial_um=-4000.0), 1.0),
-    ("calm", {"light": {"polariser_leak": 0.01, "ring_um": 4500.0}}, 1.0), ("calm", {}, 0.2), ("calm", {}, 1.3),
-    ("dim", {}, 0.3), ("dim", {}, 3.0),
-]  # fmt: skip
+    ("calm", eye(pupil_um=2500.0), 1.0),
+    ("calm", eye(axial_um=4000.0), 1.0),
+    ("calm", eye(axial_um=-4000.0), 1.0),
+    ("calm", {"light": {"polariser_leak": 0.01, "ring_um": 4500.0}}, 1.0),
+    ("calm", {}, 0.2),
+    ("calm", {}, 1.3),
+    ("dim", {}, 0.3),
+    ("dim", {}, 3.0),
+]
 BAD: dict[str, list[tuple[str, dict[str, Any], float]]] = {
     "shot.saturated": [("calm", {}, times) for times in (1.8, 2.5, 4.0, 8.0, 16.0)],
     "shot.dark": [(name, {}, times) for name, times in (("dim", 0.1), ("dim", 0.03), ("dim", 0.01), ("calm", 0.003))],
     "shot.edge": [
-        (name, eye(pupil_um=float(pupil), decentred_um=float(off)), 1.0) for name in ("calm", "dim")
+        (name, eye(pupil_um=float(pupil), decentred_um=float(off)), 1.0)
+        for name in ("calm", "dim")
         for pupil, off in ((4000, 1500), (4000, 2500), (6000, 3500), (3000, 2000))
     ],
-    "shot.pupil": [
-        (name, eye(pupil_um=float(pupil)), 1.0) for name in ("calm", "dim") for pupil in (1000, 1500, 2000)
-    ],
+    "shot.pupil": [(name, eye(pupil_um=float(pupil)), 1.0) for name in ("calm", "dim") for pupil in (1000, 1500, 2000)],
     "shot.halo": [
         ("calm", {"light": {"polariser_leak": leak, "ring_um": ring}}, 1.0)
         for leak, ring in ((0.1, 3500.0), (0.1, 4500.0), (0.15, 3500.0), (0.2, 4500.0), (0.3, 3500.0))
     ],
     "shot.moved": [("calm", eye(drift_deg_per_s=speed), 1.0) for speed in (10.0, 20.0, 30.0, 40.0)],
-}  # fmt: skip
+}
 
 
 def test_no_ordinary_eye_is_rejected() -> None:
     """False alarms: none of 36, from a thirtieth of the paper's light to eyes of eight dioptres of either sign."""
-    alarms = {(name, repr(keys), times): found.code for name, keys, times in GOOD
-              if (found := verdict(name, keys, times)).word != "good"}  # fmt: skip
+    alarms = {
+        (name, repr(keys), times): found.code
+        for name, keys, times in GOOD
+        if (found := verdict(name, keys, times)).word != "good"
+    }
     assert len(GOOD) == 36
     assert alarms == {}
 
@@ -126,8 +143,11 @@ def test_a_frame_without_light_is_dark() -> None:
 
 def test_causes_that_one_frame_cannot_show_are_not_reported() -> None:
     """Known limits: motion blur in little light or of eight degrees, and a reflex without saturation."""
-    missed = [("dim", eye(drift_deg_per_s=20.0)), ("calm", eye(drift_deg_per_s=80.0)),
-              ("calm", {"light": {"polariser_leak": 0.05, "ring_um": 4500.0}})]  # fmt: skip
+    missed = [
+        ("dim", eye(drift_deg_per_s=20.0)),
+        ("calm", eye(drift_deg_per_s=80.0)),
+        ("calm", {"light": {"polariser_leak": 0.05, "ring_um": 4500.0}}),
+    ]
     assert [verdict(*case).code for case in missed] == [None] * 3
 
 

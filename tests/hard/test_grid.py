@@ -18,10 +18,22 @@ from services.lab.reconstruct_file import reconstruct_file
 
 EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
 REDUCED = (
-    "1.0% saturated", "glare, 0.3 % clipped", "dead columns, declared", "dead columns, 0 DN", "dead blob, declared",
-    "dead blob, 0 DN", "warm, 0.10% + 1500 DN", "100 e- peak", "eye off by +2 dpt", "PSF of another head", "half a lid",
-    "1 % NaN", "all zeros", "constant", "black level off by 20 DN",
-)  # fmt: skip
+    "1.0% saturated",
+    "glare, 0.3 % clipped",
+    "dead columns, declared",
+    "dead columns, 0 DN",
+    "dead blob, declared",
+    "dead blob, 0 DN",
+    "warm, 0.10% + 1500 DN",
+    "100 e- peak",
+    "eye off by +2 dpt",
+    "PSF of another head",
+    "half a lid",
+    "1 % NaN",
+    "all zeros",
+    "constant",
+    "black level off by 20 DN",
+)
 
 
 @pytest.fixture(scope="module")

@@ -48,10 +48,17 @@ def reconstructed(root: Path, capture: Capture, *frames: str) -> tuple[Any, Any]
     place, made = root / "store" / "captures" / capture.id, root / "again"
     made.mkdir(exist_ok=True)
     words = [
-        "reconstruct", *(str(place / one) if one.endswith(".tiff") else one for one in frames),
-        "--dark", str(place / "dark.tiff"), "--calibration", str(root / "calibrations"),
-        "-o", str(made / "picture.npy"), "--report", str(made / "report.json"),
-    ]  # fmt: skip
+        "reconstruct",
+        *(str(place / one) if one.endswith(".tiff") else one for one in frames),
+        "--dark",
+        str(place / "dark.tiff"),
+        "--calibration",
+        str(root / "calibrations"),
+        "-o",
+        str(made / "picture.npy"),
+        "--report",
+        str(made / "report.json"),
+    ]
     answer = call(words)
     assert answer.code == 0, answer.err
     return np.load(made / "picture.npy"), json.loads((made / "report.json").read_text())

@@ -57,9 +57,10 @@ def test_wrong_psfs_are_distinguished() -> None:
     counts, right = shot().counts, shot().calibration.psfs[0].pixels
     found = {kind: checked(counts, psf).match for kind, psf in orientations(right).items()}
     assert found == {
-        "mirrored left-right": Match.MIRRORED_LEFT_RIGHT, "mirrored up-down": Match.MIRRORED_UP_DOWN,
+        "mirrored left-right": Match.MIRRORED_LEFT_RIGHT,
+        "mirrored up-down": Match.MIRRORED_UP_DOWN,
         "rotated by 180": Match.ROTATED,
-    }  # fmt: skip
+    }
     assert checked(counts, shuffled(right)).match is Match.FOREIGN
     another = scenes.speckle(counts.shape[:2], 5)
     assert checked(counts, another).match is Match.FOREIGN
@@ -83,9 +84,18 @@ def test_the_command_warns_of_a_rotated_and_a_mirrored_psf(tmp_path: Path) -> No
     for name, psf in {"right": right, "rotated": right[::-1, ::-1], "mirrored": right[:, ::-1]}.items():
         np.save(tmp_path / f"{name}.npy", psf)
         order = ReconstructOptions(
-            tmp_path / "raw.npy", (tmp_path / f"{name}.npy",), tmp_path / "out.npy",
-            "gradient", None, None, None, None, None, False, tmp_path,
-        )  # fmt: skip
+            tmp_path / "raw.npy",
+            (tmp_path / f"{name}.npy",),
+            tmp_path / "out.npy",
+            "gradient",
+            None,
+            None,
+            None,
+            None,
+            None,
+            False,
+            tmp_path,
+        )
         warnings[name] = tuple(words for words in reconstruct_file(order).report.warnings if "PSF" in words)
     mirrored = (MISMATCHES[Match.MIRRORED_LEFT_RIGHT],)
     assert warnings == {"right": (), "rotated": (MISMATCHES[Match.ROTATED],), "mirrored": mirrored}

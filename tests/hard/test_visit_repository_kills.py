@@ -57,8 +57,10 @@ def killed_after(seconds: float, folder: Path, round_number: int) -> list[int]:
     """Return the answers that the victim had acknowledged when it was killed, `seconds` after the first."""
     victim = subprocess.Popen(
         [sys.executable, "-W", "error", __file__, str(folder), str(round_number)],
-        cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+    )
     assert victim.stdout is not None
     first = victim.stdout.readline()
     time.sleep(seconds)

@@ -72,9 +72,11 @@ def with_all_chips(head: Head, now: datetime | None = None) -> Head:
     world = head.camera.world
     made_at = (now or VirtualClock().wall()) - timedelta(weeks=MAKE_WEEKS)
     return replace(
-        head, spec=head.spec.model_copy(update={"bus": BUS}), chips=Chips(SimThermometer(world), SimBattery(world)),
+        head,
+        spec=head.spec.model_copy(update={"bus": BUS}),
+        chips=Chips(SimThermometer(world), SimBattery(world)),
         provenance=Provenance("D-1", made_at, "a technician", "0.1.0"),
-    )  # fmt: skip
+    )
 
 
 def visit_with_consent(rig: Rig, key: str | None = None) -> dict[str, Any]:

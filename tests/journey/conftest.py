@@ -207,9 +207,15 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         event_bus = event_bus or EventBus()
         pictures = VisitRepository(records.engine, protocol or load_protocol(), clock).pictures
         exam = ExamService(
-            opened, records, event_bus, clock, plans, died.set, Watchdog(watchdog),
+            opened,
+            records,
+            event_bus,
+            clock,
+            plans,
+            died.set,
+            Watchdog(watchdog),
             resumed_target=pictures.resumed_target,
-        )  # fmt: skip
+        )
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)
@@ -326,11 +332,19 @@ async def read_event_stream(
             done.set()
 
     scope = {
-        "type": "http", "asgi": {"version": "3.0", "spec_version": "2.3"}, "http_version": "1.1", "method": "GET",
-        "scheme": "http", "path": "/api/events", "raw_path": b"/api/events", "query_string": b"", "root_path": "",
+        "type": "http",
+        "asgi": {"version": "3.0", "spec_version": "2.3"},
+        "http_version": "1.1",
+        "method": "GET",
+        "scheme": "http",
+        "path": "/api/events",
+        "raw_path": b"/api/events",
+        "query_string": b"",
+        "root_path": "",
         "headers": [(key.lower().encode(), value.encode()) for key, value in (headers or {}).items()],
-        "server": ("eye", 80), "client": ("page", 1),
-    }  # fmt: skip
+        "server": ("eye", 80),
+        "client": ("page", 1),
+    }
     await asyncio.wait_for(app(scope, receive, send), 20)
     return received
 

@@ -20,14 +20,37 @@ from services.records.capture_versions import NewVersion
 from tests.journey.asking import live_picture
 
 CHOSEN = {  # expected HTTP status of each error class
-    "SpecError": 422, "FrameError": 422, "PsfError": 422, "SettingError": 422,
-    "CameraMissing": 503, "CameraStalled": 503, "CameraMismatch": 503, "CameraPacked": 503, "LightFault": 423,
-    "DailyLightLimit": 423, "MemoryDamaged": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
-    "CalibrationMissing": 423, "CalibrationDamaged": 423, "CalibrationRefused": 423, "CalibrationFormat": 423,
-    "CalibrationUntrusted": 423, "CalibrationExpired": 423, "CalibrationStale": 423, "CalibrationModeMismatch": 423,
-    "CalibrationStopped": 423, "LoginRequired": 401, "PinWrong": 403, "PinLockedOut": 429,
-    "Busy": 409, "StoreFull": 507, "StoreDamaged": 500, "RecordNotFound": 404,
-}  # fmt: skip
+    "SpecError": 422,
+    "FrameError": 422,
+    "PsfError": 422,
+    "SettingError": 422,
+    "CameraMissing": 503,
+    "CameraStalled": 503,
+    "CameraMismatch": 503,
+    "CameraPacked": 503,
+    "LightFault": 423,
+    "DailyLightLimit": 423,
+    "MemoryDamaged": 503,
+    "HeadMismatch": 423,
+    "TooHot": 423,
+    "PowerLow": 423,
+    "CalibrationMissing": 423,
+    "CalibrationDamaged": 423,
+    "CalibrationRefused": 423,
+    "CalibrationFormat": 423,
+    "CalibrationUntrusted": 423,
+    "CalibrationExpired": 423,
+    "CalibrationStale": 423,
+    "CalibrationModeMismatch": 423,
+    "CalibrationStopped": 423,
+    "LoginRequired": 401,
+    "PinWrong": 403,
+    "PinLockedOut": 429,
+    "Busy": 409,
+    "StoreFull": 507,
+    "StoreDamaged": 500,
+    "RecordNotFound": 404,
+}
 OD = {"eye": "OD"}
 
 
@@ -71,9 +94,12 @@ def test_capture_request_answers_201_with_working_links(old_rig: Any) -> None:
         assert made["simulated"] is True
         assert (await client.get(f"/api/captures/{made['id']}")).json() == made
         media = {
-            "picture": "image/png", "colour": "image/png", "raw": "image/tiff", "quick": "image/jpeg",
+            "picture": "image/png",
+            "colour": "image/png",
+            "raw": "image/tiff",
+            "quick": "image/jpeg",
             "report": "application/json",
-        }  # fmt: skip
+        }
         assert set(made["links"]) == set(media)
         for name, link in made["links"].items():
             file = await client.get(link)
@@ -209,8 +235,14 @@ def test_body_too_large_is_refused_unread(old_rig: Any) -> None:
     assert old_rig.store.captures() == before
 
 
-UNKNOWN = [("GET", "/nowhere", 404), ("GET", "/api/nowhere", 404), ("GET", "/web/nowhere.js", 404),
-           ("GET", "/web/../services/cli.py", 404), ("DELETE", "/api/captures", 405), ("POST", "/", 405)]  # fmt: skip
+UNKNOWN = [
+    ("GET", "/nowhere", 404),
+    ("GET", "/api/nowhere", 404),
+    ("GET", "/web/nowhere.js", 404),
+    ("GET", "/web/../services/cli.py", 404),
+    ("DELETE", "/api/captures", 405),
+    ("POST", "/", 405),
+]
 
 
 @pytest.mark.parametrize(("method", "path", "status"), UNKNOWN)
@@ -241,9 +273,17 @@ def test_every_kind_of_answer_has_the_security_headers(rig: Any) -> None:
         "unforeseen": rig.ask(lambda client: client.get("/api/broken?_=1"), **quiet),
     }
     assert {name: answer.status_code for name, answer in answers.items()} == {
-        "page": 200, "script": 200, "json": 200, "file": 200, "preview": 200, "unknown": 404, "not kept": 404,
-        "wrong": 422, "too large": 422, "unforeseen": 500,
-    }  # fmt: skip
+        "page": 200,
+        "script": 200,
+        "json": 200,
+        "file": 200,
+        "preview": 200,
+        "unknown": 404,
+        "not kept": 404,
+        "wrong": 422,
+        "too large": 422,
+        "unforeseen": 500,
+    }
     for name, answer in answers.items():
         assert "default-src 'none'" in answer.headers["content-security-policy"], name
         assert answer.headers["x-content-type-options"] == "nosniff", name
@@ -299,16 +339,31 @@ def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
     document = old_rig.request("GET", "/api/openapi.json").json()
     assert document["openapi"].startswith("3.")
     fixed = {
-        "/api/captures": {"get", "post"}, "/api/captures/{id}": {"get"}, "/api/captures/{id}/{name}": {"get"},
-        "/api/events": {"get"}, "/api/preview": {"get"}, "/api/health": {"get"}, "/api/status": {"get"},
-        "/api/captures/{id}/keep": {"post"}, "/api/captures/{id}/eye": {"post"},
-        "/api/controller": {"post"}, "/api/protocol": {"get"},
-        "/api/visits": {"get", "post"}, "/api/visits/{id}": {"get", "patch"}, "/api/visits/{id}/could-not": {"post"},
-        "/api/visits/{id}/slots": {"post"}, "/api/visits/{id}/finish": {"post"}, "/api/visits/{id}/reopen": {"post"},
-        "/api/outbox": {"get"}, "/api/outbox/try": {"post"},
-        "/api/visits/{id}/montage/{eye}": {"get"}, "/api/visits/{id}/montage/{eye}/picture.png": {"get"},
-        "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},
-    }  # fmt: skip
+        "/api/captures": {"get", "post"},
+        "/api/captures/{id}": {"get"},
+        "/api/captures/{id}/{name}": {"get"},
+        "/api/events": {"get"},
+        "/api/preview": {"get"},
+        "/api/health": {"get"},
+        "/api/status": {"get"},
+        "/api/captures/{id}/keep": {"post"},
+        "/api/captures/{id}/eye": {"post"},
+        "/api/controller": {"post"},
+        "/api/protocol": {"get"},
+        "/api/visits": {"get", "post"},
+        "/api/visits/{id}": {"get", "patch"},
+        "/api/visits/{id}/could-not": {"post"},
+        "/api/visits/{id}/slots": {"post"},
+        "/api/visits/{id}/finish": {"post"},
+        "/api/visits/{id}/reopen": {"post"},
+        "/api/outbox": {"get"},
+        "/api/outbox/try": {"post"},
+        "/api/visits/{id}/montage/{eye}": {"get"},
+        "/api/visits/{id}/montage/{eye}/picture.png": {"get"},
+        "/api/exports": {"get"},
+        "/api/visits/{id}/export.zip": {"get"},
+        "/api/visits/{id}/export": {"post"},
+    }
     served = {path: set(verbs) for path, verbs in document["paths"].items()}
     login_required = ("/api/technician", "/api/calibration")
     assert {path: verbs for path, verbs in served.items() if not path.startswith(login_required)} == fixed
@@ -362,9 +417,16 @@ def test_events_of_a_capture_are_ordered_and_their_links_work(old_rig: Any, read
     news = [event for event in events if event[1] != "beat"]
     sequence = [(kind, data.get("state") or data.get("stage") or data.get("word")) for _, kind, data in news]
     assert sequence == [
-        ("state", "busy"), ("stage", "expose"), ("stage", "expose"), ("verdict", "good"), ("state", "making"),
-        ("stage", "quick"), ("stage", "keep"), ("kept", None), ("state", "aim"),
-    ]  # fmt: skip
+        ("state", "busy"),
+        ("stage", "expose"),
+        ("stage", "expose"),
+        ("verdict", "good"),
+        ("state", "making"),
+        ("stage", "quick"),
+        ("stage", "keep"),
+        ("kept", None),
+        ("state", "aim"),
+    ]
     numbers = [number for number, _, _ in news]
     assert numbers == list(range(numbers[0], numbers[0] + 9))
     fractions = [data["fraction"] for _, kind, data in news if kind == "stage"]
@@ -430,12 +492,15 @@ def test_versions_of_a_capture_are_listed_with_working_links(old_rig: Any) -> No
     assert capture["links"] == taken["links"]
     first, second = capture["versions"]
     assert first == {
-        "number": 1, "result": "a" * 32, "at": old_rig.clock.wall().isoformat(), "method": "variation",
-        "software": "1.2", "picture": f"{at}/picture-1.png", "report": f"{at}/report-1.json",
-    }  # fmt: skip
-    picture, colour, report = (
-        old_rig.request("GET", second[name]) for name in ("picture", "colour", "report")
-    )  # fmt: skip
+        "number": 1,
+        "result": "a" * 32,
+        "at": old_rig.clock.wall().isoformat(),
+        "method": "variation",
+        "software": "1.2",
+        "picture": f"{at}/picture-1.png",
+        "report": f"{at}/report-1.json",
+    }
+    picture, colour, report = (old_rig.request("GET", second[name]) for name in ("picture", "colour", "report"))
     assert (picture.content, picture.headers["content-type"]) == (b"new", "image/png")
     assert (colour.content, report.json()) == (b"new in colour", {"method": "variation"})
     assert old_rig.request("GET", taken["links"]["picture"]).content == old_rig.store.read(kept.id, "picture.png")

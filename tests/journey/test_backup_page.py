@@ -52,8 +52,13 @@ def test_a_backup_beside_the_exam_restores_its_captures(ask: Ask, rig: Rig, stic
     until(lambda: bool(rig.store.captures()))
     first = rig.store.captures()[0].id
     assert ask("GET").json() == {
-        "has_key": False, "last": None, "is_due": False, "done": None, "total": None, "error": None,
-    }  # fmt: skip
+        "has_key": False,
+        "last": None,
+        "is_due": False,
+        "done": None,
+        "total": None,
+        "error": None,
+    }
     assert ask("POST", "/passphrase", json={"passphrase": PASSPHRASE}).json()["has_key"]
     assert ask("POST", json={"folder": drive_id(stick)}).status_code == 200
     done = ended(ask)
@@ -100,6 +105,8 @@ def test_what_prevents_a_backup_is_in_the_state(ask: Ask, rig: Rig, stick: Path,
 
 def test_backups_need_the_login(rig: Rig, ask: Ask) -> None:
     for method, path, body in (
-        ("GET", "", None), ("POST", "", {"folder": "/"}), ("POST", "/passphrase", {"passphrase": PASSPHRASE}),
-    ):  # fmt: skip
+        ("GET", "", None),
+        ("POST", "", {"folder": "/"}),
+        ("POST", "/passphrase", {"passphrase": PASSPHRASE}),
+    ):
         assert rig.request(method, f"/api/technician/backup{path}", json=body).status_code == 401

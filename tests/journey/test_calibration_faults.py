@@ -14,10 +14,12 @@ from services.lab.calibrate_head import calibrate
 from tests.journey.conftest import SMALL_HEAD, Diffuscope
 
 SMALL = (
-    SMALL_HEAD.replace("rows = 270", "rows = 136").replace("cols = 480", "cols = 240").replace("20.16", "40.32")
+    SMALL_HEAD.replace("rows = 270", "rows = 136")
+    .replace("cols = 480", "cols = 240")
+    .replace("20.16", "40.32")
     .replace("haemorrhages = 3", 'kind = "point"')
     + "\n[sim.sensor]\nprnu = 0.01\ndsnu_e = 2.0\n"
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +93,9 @@ def test_the_calibrate_command_resumes_after_a_fault(
     done = diffuscope(*words)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[:2] == [
-        "darks: measured before, taken up again", "flats: measured before, taken up again",
-    ]  # fmt: skip
+        "darks: measured before, taken up again",
+        "flats: measured before, taken up again",
+    ]
 
 
 @pytest.mark.parametrize(("stand", "mishap"), [("eye", "moving"), ("cap", "rain"), ("cap", "")])

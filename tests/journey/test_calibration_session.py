@@ -35,9 +35,11 @@ from tests.unit.test_trial_lenses import WHO
 
 FLAWS = "\n[sim.sensor]\nprnu = 0.01\ndsnu_e = 2.0\nhot_pixels = 0.0003\n"
 TINY = (
-    SMALL_HEAD.replace("rows = 270", "rows = 136").replace("cols = 480", "cols = 240").replace("20.16", "40.32")
+    SMALL_HEAD.replace("rows = 270", "rows = 136")
+    .replace("cols = 480", "cols = 240")
+    .replace("20.16", "40.32")
     .replace("haemorrhages = 3", 'kind = "point"')  # saves the simulation of vessels
-)  # fmt: skip
+)
 CHIPS = '\n[bus]\nbackend = "sim"\nthermometer = 0x48\nmemory = 0x50\n'
 STANDS = ("cap", "screen", "point")
 
@@ -169,11 +171,17 @@ def station(make_station: MakeStation) -> Station:
 
 
 PROTECTED = [
-    ("GET", "/api/calibration"), ("POST", "/api/calibration"), ("POST", "/api/calibration/ready"),
-    ("POST", "/api/calibration/cancel"), ("POST", "/api/calibration/use"), ("GET", "/api/calibration/preview"),
-    ("POST", "/api/calibration/trial-lenses"), ("POST", "/api/calibration/trial-lenses/ready"),
-    ("POST", "/api/technician/lock"), ("POST", "/api/technician/here"),
-]  # fmt: skip
+    ("GET", "/api/calibration"),
+    ("POST", "/api/calibration"),
+    ("POST", "/api/calibration/ready"),
+    ("POST", "/api/calibration/cancel"),
+    ("POST", "/api/calibration/use"),
+    ("GET", "/api/calibration/preview"),
+    ("POST", "/api/calibration/trial-lenses"),
+    ("POST", "/api/calibration/trial-lenses/ready"),
+    ("POST", "/api/technician/lock"),
+    ("POST", "/api/technician/here"),
+]
 
 
 def test_technician_endpoints_require_the_pin_and_captures_do_not(make_station: MakeStation) -> None:
@@ -386,8 +394,17 @@ def test_a_full_disk_is_reported_and_the_step_is_requested_again(station: Statio
     assert station.await_request() == "screen"
 
 
-BAD = [{}, {"by": ""}, {"by": "   "}, {"by": "a\nb"}, {"by": "x" * 61}, {"by": "Ada", "source_deg": -1},
-       {"by": "Ada", "source_deg": 6}, {"by": "Ada", "lamp": 1}, {"by": "Ada", "serial": " "}]  # fmt: skip
+BAD = [
+    {},
+    {"by": ""},
+    {"by": "   "},
+    {"by": "a\nb"},
+    {"by": "x" * 61},
+    {"by": "Ada", "source_deg": -1},
+    {"by": "Ada", "source_deg": 6},
+    {"by": "Ada", "lamp": 1},
+    {"by": "Ada", "serial": " "},
+]
 
 
 @pytest.mark.parametrize("body", BAD)

@@ -177,9 +177,17 @@ def test_imported_psf_lists_its_unknown_values(run_command, theirs, tmp_path):
     kept = archive.load(id)
     assert kept.provenance.origin == "imported"
     assert kept.provenance.unknown == (
-        "serial", "gain_e_per_dn", "read_noise_e", "geometry", "field_deg", "dark_dn", "flat", "bad", "black_dn",
+        "serial",
+        "gain_e_per_dn",
+        "read_noise_e",
+        "geometry",
+        "field_deg",
+        "dark_dn",
+        "flat",
+        "bad",
+        "black_dn",
         "white_dn",
-    )  # fmt: skip
+    )
     assert dict(kept.provenance.figures)["pitch_um"] == 6.5
     output = run_command("show", id, "--archive", archive.root)
     assert "black unknown, white unknown, gain unknown, read noise unknown, 96 x 128 pixels" in output

@@ -19,10 +19,29 @@ from tests.journey.conftest import Diffuscope
 from tests.progress_lines import without_progress
 
 REPORT_KEYS = {  # the public interface
-    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
-    "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "solved", "given",
-    "psf_channels", "bayer", "frames", "channels", "simulated",
-}  # fmt: skip
+    "method",
+    "bin",
+    "rounds",
+    "stopped",
+    "seconds",
+    "psf_index",
+    "psf_scale",
+    "psf_cylinder",
+    "refraction_dpt",
+    "refraction_scatter",
+    "regularisation",
+    "noise_dn",
+    "residual",
+    "quality",
+    "warnings",
+    "solved",
+    "given",
+    "psf_channels",
+    "bayer",
+    "frames",
+    "channels",
+    "simulated",
+}
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +97,17 @@ def test_reconstruct_writes_picture_and_report(
 ) -> None:
     out, report = tmp_path / "x.npy", tmp_path / "r.json"
     done = diffuscope(
-        "reconstruct", scene / "raw.tiff", "--psf", scene / "psf.tiff", "--head", head_file, "-o", out,
-        "--report", report,
-    )  # fmt: skip
+        "reconstruct",
+        scene / "raw.tiff",
+        "--psf",
+        scene / "psf.tiff",
+        "--head",
+        head_file,
+        "-o",
+        out,
+        "--report",
+        report,
+    )
     assert done.returncode == 0, done.stderr
     assert str(out) in done.stdout
     picture, truth = read_image(out), read_image(scene / "truth.npy")
@@ -97,9 +124,18 @@ def test_reconstruct_writes_picture_and_report(
 
 def make_options(scene: Path, plans: Path, output: Path, **changes: Any) -> ReconstructOptions:
     asked: dict[str, Any] = {
-        "raw": scene / "raw.tiff", "psfs": (scene / "psf.tiff",), "output": output, "method": "gradient",
-        "budget_s": None, "dark": None, "flat": None, "head": None, "field_deg": None, "even": False, "plans": plans,
-    }  # fmt: skip
+        "raw": scene / "raw.tiff",
+        "psfs": (scene / "psf.tiff",),
+        "output": output,
+        "method": "gradient",
+        "budget_s": None,
+        "dark": None,
+        "flat": None,
+        "head": None,
+        "field_deg": None,
+        "even": False,
+        "plans": plans,
+    }
     return ReconstructOptions(**asked | changes)
 
 
@@ -159,10 +195,17 @@ def broken(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     nan = psf.copy()
     nan[5, 5] = np.nan
     for name, array in {
-        "nan": nan, "zero": 0 * psf, "negative": -psf, "small": psf[::2, ::2], "line": psf[0], "stack": psf[None, None],
-        "half": raw[::2], "signed": raw.astype(np.int32) - 1000, "allnan": np.full(raw.shape, np.nan),
+        "nan": nan,
+        "zero": 0 * psf,
+        "negative": -psf,
+        "small": psf[::2, ::2],
+        "line": psf[0],
+        "stack": psf[None, None],
+        "half": raw[::2],
+        "signed": raw.astype(np.int32) - 1000,
+        "allnan": np.full(raw.shape, np.nan),
         "full": np.full(raw.shape, 65535, np.uint16),
-    }.items():  # fmt: skip
+    }.items():
         np.save(folder / f"{name}.npy", array)
     whole = (scene / "raw.tiff").read_bytes()
     (folder / "cut.tiff").write_bytes(whole[: len(whole) // 2])
@@ -173,11 +216,17 @@ def broken(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 BAD_RAWS = {
-    "none.tiff": "No such file", "cut.tiff": "is not a whole tiff", "empty.tiff": "is empty",
+    "none.tiff": "No such file",
+    "cut.tiff": "is not a whole tiff",
+    "empty.tiff": "is empty",
     "text.png": "is not a whole png",
-    "old.bmp": "'.bmp' is not one of", "line.npy": "rows and columns", "stack.npy": "rows and columns",
-    "signed.npy": "negative", "allnan.npy": "cannot be used|marked bad", "half.npy": "the raw 135 x 480",
-}  # fmt: skip
+    "old.bmp": "'.bmp' is not one of",
+    "line.npy": "rows and columns",
+    "stack.npy": "rows and columns",
+    "signed.npy": "negative",
+    "allnan.npy": "cannot be used|marked bad",
+    "half.npy": "the raw 135 x 480",
+}
 
 
 @pytest.mark.parametrize("name", BAD_RAWS)
@@ -190,11 +239,17 @@ def test_unusable_raw_is_refused(scene: Path, broken: Path, tmp_path: Path, refu
 
 
 BAD_PSFS = {
-    "none.tiff": "No such file", "nan.npy": "not numbers", "zero.npy": "positive sum", "negative.npy": "positive sum",
-    "small.npy": "small.npy has 135 x 240 pixels, the raw 270 x 480", "line.npy": "rows and columns",
-    "stack.npy": "rows and columns", "empty.tiff": "is empty", "text.png": "is not a whole png",
+    "none.tiff": "No such file",
+    "nan.npy": "not numbers",
+    "zero.npy": "positive sum",
+    "negative.npy": "positive sum",
+    "small.npy": "small.npy has 135 x 240 pixels, the raw 270 x 480",
+    "line.npy": "rows and columns",
+    "stack.npy": "rows and columns",
+    "empty.tiff": "is empty",
+    "text.png": "is not a whole png",
     "signed.npy": "negative",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD_PSFS)

@@ -38,9 +38,17 @@ STATES = re.findall(r'"(\w+\.\w+)"', ALERTS.split("const TABLE = [")[1].split("\
 SPOKEN = r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"'
 WORDS = dict(re.findall(SPOKEN, (WEB / "i18n/en.js").read_text()))
 REFUSALS = {
-    "camera.missing", "light.fault", "light.limit", "light.day", "store.full", "batt.empty", "heat.hot", "link.other",
-    "consent.missing", "consent.declined",
-}  # fmt: skip
+    "camera.missing",
+    "light.fault",
+    "light.limit",
+    "light.day",
+    "store.full",
+    "batt.empty",
+    "heat.hot",
+    "link.other",
+    "consent.missing",
+    "consent.declined",
+}
 
 
 @pytest.fixture(scope="module")
@@ -185,11 +193,15 @@ def test_stage_events_estimate_the_seconds_left(make_rig: MakeRig) -> None:
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
-        ({}, 403), ({"Sec-Fetch-Site": "cross-site"}, 403), ({"Sec-Fetch-Site": "same-site"}, 403),
-        ({"Sec-Fetch-Site": "cross-site", "X-Controller": "stolen"}, 403), ({"X-Controller": "a script"}, 200),
-        ({"Sec-Fetch-Site": "same-origin"}, 200), ({"Sec-Fetch-Site": "none"}, 200),
+        ({}, 403),
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Sec-Fetch-Site": "same-site"}, 403),
+        ({"Sec-Fetch-Site": "cross-site", "X-Controller": "stolen"}, 403),
+        ({"X-Controller": "a script"}, 200),
+        ({"Sec-Fetch-Site": "same-origin"}, 200),
+        ({"Sec-Fetch-Site": "none"}, 200),
     ],
-)  # fmt: skip
+)
 def test_a_cross_site_request_for_live_pictures_is_refused_without_light(
     old_rig: Rig, headers: dict[str, str], status: int
 ) -> None:

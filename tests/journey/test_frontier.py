@@ -18,9 +18,18 @@ ROOT = Path(__file__).parents[2]
 COMMAND = str(Path(sys.executable).parent / "diffuscope")
 DIABETIC = ROOT / "device" / "sim" / "scenes" / "diabetic.toml"
 POINT = {
-    "method", "bin", "rounds", "seconds_median", "seconds_p95", "pcc", "psnr_db", "ssim", "highpass_pcc",
-    "vessel_contrast", "pareto",
-}  # fmt: skip
+    "method",
+    "bin",
+    "rounds",
+    "seconds_median",
+    "seconds_p95",
+    "pcc",
+    "psnr_db",
+    "ssim",
+    "highpass_pcc",
+    "vessel_contrast",
+    "pareto",
+}
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -51,9 +60,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
     found, plot = tmp_path / "f.json", tmp_path / "f.svg"
-    done = diffuscope(
-        "frontier", "--scene", tiny, "--json", found, "--plot", plot, "--repeats", 5, "--budget-s", 5
-    )  # fmt: skip
+    done = diffuscope("frontier", "--scene", tiny, "--json", found, "--plot", plot, "--repeats", 5, "--budget-s", 5)
     assert done.returncode == 0, done.stderr
     facts = json.loads(found.read_text())
     assert {"machine", "versions", "scene", "region", "points", "budget_s", "choice", "dominated"} <= set(facts)

@@ -13,11 +13,22 @@ def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait
     old_rig.request("POST", "/api/captures", json={"eye": "OD"})
     well = old_rig.request("GET", "/api/health").json()
     assert {check["name"] for check in well["checks"]} == {
-        "camera", "lamp", "calibration", "captures", "database", "space",
-        "battery", "heat", "clock", "speed", "sending", "backup",
+        "camera",
+        "lamp",
+        "calibration",
+        "captures",
+        "database",
+        "space",
+        "battery",
+        "heat",
+        "clock",
+        "speed",
+        "sending",
+        "backup",
         "light_limits",
-        "settings", "power",
-    }  # fmt: skip
+        "settings",
+        "power",
+    }
     old_rig.world.faults.add("camera.missing")
     live_picture(old_rig.exam, 0, wait_s=0.0)
     wait_until(lambda: old_rig.exam.problem is not None)

@@ -32,9 +32,12 @@ def test_an_idempotency_key_of_another_eye_visit_or_slot_is_refused_without_ligh
     kept = post_capture(rig, **request_body)
     assert kept.status_code == 201
     others: list[dict[str, Any]] = [
-        {"eye": "OD"}, {"eye": "OS"}, request_body | {"visit": second}, request_body | {"slot": "R-nerve"},
+        {"eye": "OD"},
+        {"eye": "OS"},
+        request_body | {"visit": second},
+        request_body | {"slot": "R-nerve"},
         request_body | {"eye": "OS", "slot": "L-centre"},
-    ]  # fmt: skip
+    ]
     for other in others:
         answer = post_capture(rig, **other)
         assert (answer.status_code, answer.json()["code"]) == (409, "refused.key"), other

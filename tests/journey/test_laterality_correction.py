@@ -109,8 +109,13 @@ def test_a_capture_of_the_other_eye_is_moved_and_the_move_is_recorded(rig: Any) 
     headers, order = {"X-Controller": "b" * 16}, {"key": next(keys), "eye": "OS"}
     moved = rig.request("POST", f"/api/captures/{wrong}/eye", json=order, headers=headers).json()
     assert moved["slots"]["R-centre"] | {"verdict": None} == {
-        "state": "taken", "capture": first, "captures": [first], "verdict": None, "reason": None, "tries": 1,
-    }  # fmt: skip
+        "state": "taken",
+        "capture": first,
+        "captures": [first],
+        "verdict": None,
+        "reason": None,
+        "tries": 1,
+    }
     assert moved["slots"]["L-centre"]["capture"] == wrong
     now = rig.request("GET", f"/api/captures/{wrong}").json()
     assert (now["eye"], now["slot"], now["files"]) == ("OS", "L-centre", before["files"])

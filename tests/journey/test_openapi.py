@@ -142,8 +142,9 @@ def test_every_problem_response_is_declared_as_json(document: dict[str, Any]) ->
             for status in ("4XX", "5XX"):
                 ((media_type, content),) = operation["responses"][status]["content"].items()
                 assert (media_type, content["schema"]["$ref"].rpartition("/")[2]) == (
-                    "application/json", "ProblemResponse",
-                ), path  # fmt: skip
+                    "application/json",
+                    "ProblemResponse",
+                ), path
 
 
 def test_no_field_of_a_body_has_the_type_any() -> None:

@@ -47,8 +47,10 @@ def test_red_and_two_greens_give_a_colour_picture_with_a_predicted_blue(folder: 
     assert "blue is predicted" in done.err
     report = json.loads((folder / "report.json").read_text())
     assert [(one["name"], one["predicted"]) for one in report["channels"]] == [
-        ("green", False), ("red", False), ("blue", True),
-    ]  # fmt: skip
+        ("green", False),
+        ("red", False),
+        ("blue", True),
+    ]
     assert report["channels"][1]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)  # a quarter of a sample
     assert report["channels"][2]["shift_px"] is None
     assert [one["index"] for one in report["frames"]] == [0, 1, 2]

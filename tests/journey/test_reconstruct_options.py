@@ -34,9 +34,17 @@ def refusal(answer: Answer) -> str:
 
 def options(raw: Any, psfs: Iterable[Any], **changes: Any) -> ReconstructOptions:
     known: dict[str, Any] = {
-        "output": None, "method": "gradient", "budget_s": None, "dark": None, "flat": None, "head": None,
-        "field_deg": None, "even": False, "plans": None, "bin": 1,
-    }  # fmt: skip
+        "output": None,
+        "method": "gradient",
+        "budget_s": None,
+        "dark": None,
+        "flat": None,
+        "head": None,
+        "field_deg": None,
+        "even": False,
+        "plans": None,
+        "bin": 1,
+    }
     return ReconstructOptions(raw, tuple(psfs), **known | changes)
 
 
@@ -205,10 +213,12 @@ def test_stack_in_one_file_is_a_choice_of_depths(folder: Path) -> None:
 @pytest.mark.parametrize(
     "quality",
     [
-        {"saturated": 0.1}, {"saturated": 0.0, "through": 0.1}, {"saturated": 0.0, "coverage": 0.5},
+        {"saturated": 0.1},
+        {"saturated": 0.0, "through": 0.1},
+        {"saturated": 0.0, "coverage": 0.5},
         {"saturated": 0.0, "banding": 0.1},
     ],
-)  # fmt: skip
+)
 def test_rules_are_one_and_files_have_words_of_their_own(quality: dict[str, float | None]) -> None:
     operator, files = (quality_warnings(quality, Match.UNKNOWN, None, audience) for audience in Audience)
     assert len(operator) == len(files) == 1

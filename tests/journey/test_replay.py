@@ -291,9 +291,12 @@ def test_named_files_need_no_folder_of_their_own(folder: Path, play: Played) -> 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason=f"the recordings are not in {RECORDINGS}")
 @pytest.mark.parametrize(
     ("name", "shape", "psf"),
-    [("tutorial", (1200, 1600), "psf_sample.tif"), ("diffusercam3d", (270, 320), "psf16.tiff"),
-     ("dlmd", (270, 480, 3), "derived_psf_480x270_f32.npy")],
-)  # fmt: skip
+    [
+        ("tutorial", (1200, 1600), "psf_sample.tif"),
+        ("diffusercam3d", (270, 320), "psf16.tiff"),
+        ("dlmd", (270, 480, 3), "derived_psf_480x270_f32.npy"),
+    ],
+)
 def test_a_real_recording_gives_a_picture_after_one_press(
     play: Played, name: str, shape: tuple[int, ...], psf: str
 ) -> None:

@@ -145,9 +145,12 @@ def test_each_unsuitable_bundle_is_listed_with_its_error(page: Page) -> None:
     (board.stick / "folder.raucb").mkdir()
     found = {one["name"]: one for one in page.looked()["found"]}
     assert {name: one["trouble"]["code"] for name, one in found.items()} == {
-        "foreign.raucb": "update.foreign", "other.raucb": "update.device", "older.raucb": "update.older",
-        "far.raucb": "update.step", "damaged.raucb": "update.damaged",
-    }  # fmt: skip
+        "foreign.raucb": "update.foreign",
+        "other.raucb": "update.device",
+        "older.raucb": "update.older",
+        "far.raucb": "update.step",
+        "damaged.raucb": "update.damaged",
+    }
     now = page.installed(found["foreign.raucb"]["id"])  # the updater itself refuses it too
     assert (now["state"], now["trouble"]["code"]) == ("refused", "update.foreign")
     assert len(now["found"]) == 5

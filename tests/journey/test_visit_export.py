@@ -136,9 +136,13 @@ def test_an_interrupted_copy_is_replaced(stick: Path) -> None:
 def test_a_full_usb_drive_is_an_error_and_no_partial_copy_remains(tmp_path: Path) -> None:
     """A limit on the length of a file simulates the full drive; it needs no privileges."""
     result = subprocess.run(
-        [sys.executable, "-W", "error", __file__, str(tmp_path)], cwd=Path(__file__).parents[2], check=True,
-        capture_output=True, text=True, env={"PYTHONPATH": str(Path(__file__).parents[2])},
-    )  # fmt: skip
+        [sys.executable, "-W", "error", __file__, str(tmp_path)],
+        cwd=Path(__file__).parents[2],
+        check=True,
+        capture_output=True,
+        text=True,
+        env={"PYTHONPATH": str(Path(__file__).parents[2])},
+    )
     assert result.stdout.split() == ["UsbDriveFull", "[]"]
 
 

@@ -18,9 +18,19 @@ EYES = {"R-centre": "OD", "R-nerve": "OD", "L-centre": "OS", "L-nerve": "OS"}
 JSON = {"Content-Type": "application/json"}
 keys = (f"{number:016x}" for number in count(1))
 HOSTILE = [
-    "<script>alert(1)</script>", "'; DROP TABLE persons; --", '"><img src=x onerror=alert(1)>', "../../etc/passwd",
-    "{{7*7}}", "\u202egnp.exe", "மீனாட்சி சுந்தரம்", "a\x00b", "\r\nSet-Cookie: a=b", "😀" * 60, "NULL", "%s%n",
-]  # fmt: skip
+    "<script>alert(1)</script>",
+    "'; DROP TABLE persons; --",
+    '"><img src=x onerror=alert(1)>',
+    "../../etc/passwd",
+    "{{7*7}}",
+    "\u202egnp.exe",
+    "மீனாட்சி சுந்தரம்",
+    "a\x00b",
+    "\r\nSet-Cookie: a=b",
+    "😀" * 60,
+    "NULL",
+    "%s%n",
+]
 
 
 def refused(answer: httpx.Response, status: int, code: str) -> dict[str, str]:
@@ -154,8 +164,11 @@ def test_a_visit_without_possible_pictures_can_be_finished(old_rig: Any) -> None
     ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
     assert ended["outcome"] == {"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}
     where = f"/api/visits/{visit['id']}/could-not"
-    refused(old_rig.request("POST", where, json={"key": next(keys), "slot": "R-centre", "reason": "pupil"}), 409,
-            "visit.finished")  # fmt: skip
+    refused(
+        old_rig.request("POST", where, json={"key": next(keys), "slot": "R-centre", "reason": "pupil"}),
+        409,
+        "visit.finished",
+    )
 
 
 def test_a_finish_can_be_undone_on_the_same_day_of_the_instruments_clock(old_rig: Any) -> None:
@@ -220,14 +233,34 @@ def test_hostile_text_is_stored_unchanged(old_rig: Any, text: str) -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("name", "x" * 121), ("phone", "1" * 41), ("village", "v" * 5000), ("name", "\ud800"), ("name", "  "),
-        ("name", 7), ("name", ["a"]), ("age", -1), ("age", 126), ("age", "54"), ("age", True), ("age", 10**30),
-        ("sex", "f"), ("consent", "yes"), ("diabetes", True), ("vision_od", "6/7"), ("vision_os", 6),
-        ("complaints", ["none", "pain"]), ("complaints", ["pain", "pain"]), ("complaints", "pain"),
-        ("drops_od", "noon"), ("drops_os", "٠٩:٤٠"), ("diabetes_years", "m" * 21), ("id", "x"), ("outcome", "send"),
+        ("name", "x" * 121),
+        ("phone", "1" * 41),
+        ("village", "v" * 5000),
+        ("name", "\ud800"),
+        ("name", "  "),
+        ("name", 7),
+        ("name", ["a"]),
+        ("age", -1),
+        ("age", 126),
+        ("age", "54"),
+        ("age", True),
+        ("age", 10**30),
+        ("sex", "f"),
+        ("consent", "yes"),
+        ("diabetes", True),
+        ("vision_od", "6/7"),
+        ("vision_os", 6),
+        ("complaints", ["none", "pain"]),
+        ("complaints", ["pain", "pain"]),
+        ("complaints", "pain"),
+        ("drops_od", "noon"),
+        ("drops_os", "٠٩:٤٠"),
+        ("diabetes_years", "m" * 21),
+        ("id", "x"),
+        ("outcome", "send"),
         ("\ud800", 1),
     ],
-)  # fmt: skip
+)
 def test_an_invalid_answer_is_422_with_a_remedy_and_changes_nothing(old_rig: Any, field: str, value: Any) -> None:
     visit = begin(old_rig)
     refused(patch(old_rig, visit, field, value), 422, "input")
@@ -237,11 +270,21 @@ def test_an_invalid_answer_is_422_with_a_remedy_and_changes_nothing(old_rig: Any
 def test_every_form_field_stores_and_returns_its_answers(old_rig: Any) -> None:
     visit = begin(old_rig)
     answers = {
-        "consent": "declined", "age": 0, "sex": "other", "diabetes": "unknown", "diabetes_years": "5-10",
-        "vision_od": "6/60", "vision_os": "NLP", "glasses": "yes", "drops_od": "09:40",
-        "drops_os": "2026-03-01T09:40:00Z", "complaints": ["flashes", "red"], "name": "N",
-        "phone": "+91 1", "village": "V",
-    }  # fmt: skip
+        "consent": "declined",
+        "age": 0,
+        "sex": "other",
+        "diabetes": "unknown",
+        "diabetes_years": "5-10",
+        "vision_od": "6/60",
+        "vision_os": "NLP",
+        "glasses": "yes",
+        "drops_od": "09:40",
+        "drops_os": "2026-03-01T09:40:00Z",
+        "complaints": ["flashes", "red"],
+        "name": "N",
+        "phone": "+91 1",
+        "village": "V",
+    }
     for field, value in answers.items():
         assert patch(old_rig, visit, field, value).status_code == 200
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"] == answers
@@ -390,8 +433,11 @@ def test_the_free_space_is_given_in_visits(make_rig: Any) -> None:
     rig = make_rig(store={"free_bytes": lambda _: 40_000_000 * 12})
     assert rig.request("GET", "/api/status").json()["people_left"] == 12  # four pictures each, of ten million bytes
     visit = agreed(rig)
-    used = sum(len(rig.store.read(made["id"], name)) for made in [shoot(rig, visit, slot) for slot in SLOTS[:2]]
-               for name in made["files"])  # fmt: skip
+    used = sum(
+        len(rig.store.read(made["id"], name))
+        for made in [shoot(rig, visit, slot) for slot in SLOTS[:2]]
+        for name in made["files"]
+    )
     half = rig.request("GET", "/api/status").json()["people_left"]
     assert half == 480_000_000 // (used // 2) // 4  # an open visit with two pictures will have four
     post(rig, f"/api/visits/{visit['id']}/finish")

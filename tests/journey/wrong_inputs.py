@@ -164,7 +164,8 @@ WRONG_INPUTS = (
     WrongInput("one line of pixels", raw_of("line.npy", saved(np.arange(99))), "rows and columns"),
     WrongInput("fourth channel, npy", raw_of("four.npy", saved(four_channels())), "fourth channel"),
     WrongInput(
-        "fourth channel, tiff", raw_of("four.tiff", lambda path: tifffile.imwrite(path, four_channels())),
+        "fourth channel, tiff",
+        raw_of("four.tiff", lambda path: tifffile.imwrite(path, four_channels())),
         "alpha channel",
     ),
     WrongInput("transparent png", raw_of("clear.png", transparent), "transparent"),
@@ -186,8 +187,10 @@ WRONG_INPUTS = (
     ),
     WrongInput("compressed dng", raw_of("raw.dng", compressed_dng), "compressed by JPEG"),
     WrongInput(
-        "frame of a monochrome sensor labelled as a mosaic", raw_of("mono.dng", labelled_dng),
-        "labelled as a colour mosaic (bggr)", noted=True,
+        "frame of a monochrome sensor labelled as a mosaic",
+        raw_of("mono.dng", labelled_dng),
+        "labelled as a colour mosaic (bggr)",
+        noted=True,
     ),
     WrongInput(
         "picture as raw", raw_of("eye.png", lambda path: path.write_bytes(to_png(scene(), simulated=False))), "sRGB"
@@ -204,8 +207,10 @@ WRONG_INPUTS = (
         "raw and PSF swapped", lambda folder: reconstruct(folder, raw="psf.npy", psf="raw.npy"), "swapped", noted=True
     ),
     WrongInput(
-        "colour PSF of a grey raw", psf_of("colour.npy", np.dstack([caustic(), caustic() // 2, caustic() // 3])),
-        "were averaged", noted=True,
+        "colour PSF of a grey raw",
+        psf_of("colour.npy", np.dstack([caustic(), caustic() // 2, caustic() // 3])),
+        "were averaged",
+        noted=True,
     ),
     WrongInput("dark frame of another size", small_dark, "dark.npy has 48 x 128 pixels, the raw 96 x 128"),
     WrongInput("negative time", option("--budget-s", "-1"), "is not a time"),
@@ -213,7 +218,7 @@ WRONG_INPUTS = (
     WrongInput("unknown setting", option("--set", "lambda=1"), "no setting 'lambda'"),
     WrongInput("folder that does not exist", option("-o", "DIR/none/x.npy"), "does not exist"),
     WrongInput("unknown table in a head file", unknown_table, "did you mean 'sim.object'?"),
-)  # fmt: skip
+)
 
 
 def write_right_inputs(folder: Path) -> None:

@@ -51,7 +51,8 @@ def test_guide_has_the_figures_of_the_models(d: Dimensions) -> None:
     leds = [lit(d, azimuth) for azimuth in range(0, 360, 15)]
     spacer, glass = d.board_z_mm - d.cell_rear_z_mm, d.image_z_mm - d.path.optics.diffuser_to_sensor_um / 1000
     figures = [
-        f"**sensor spacer**, {spacer:.2f} mm thick", f"glass in between takes {glass:.2f} mm",
+        f"**sensor spacer**, {spacer:.2f} mm thick",
+        f"glass in between takes {glass:.2f} mm",
         f"than {-tube_flange.tube_z_mm(d)[1]:g} mm. Its axis is {d.lens_y_mm:.2f} mm above",
         f"holes is {d.led_hole_mm:.2f} mm wide and {d.led_y_mm - d.cap_end_y_mm:.2f} mm long",
         f"edge of the field {sum(leds) / len(leds) / 8:.2f} of it",
@@ -59,8 +60,9 @@ def test_guide_has_the_figures_of_the_models(d: Dimensions) -> None:
         f"the diffuser ({d.bought.diffuser_mm:g} mm, {d.bought.diffuser_thick_mm:g} mm",
         f"the cap's walls of {d.fit.baffle_mm:g} mm nor the iris's edge of {iris.LAND_MM:g} mm",
         f"cap's holes are {100 * (cone_share(d, d.led_hole_mm + 0.1) - 1):.0f} % of the field",
-        f"the plate ({d.plate_thick_mm:g} mm", f"over its board ({d.bought.image_above_board_mm:g} mm)",
-    ]  # fmt: skip
+        f"the plate ({d.plate_thick_mm:g} mm",
+        f"over its board ({d.bought.image_above_board_mm:g} mm)",
+    ]
     guide = " ".join(text("hardware/assembly.md").split())
     assert [figure for figure in figures if figure not in guide] == []
     assert (min(leds), max(leds)) == (4, 8)

@@ -84,10 +84,16 @@ def test_the_field_table(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "field", "share"),
     [
-        ("imx296", 33.4, 0.72), ("imx296", 45, 0.54), ("quantalux", 33.4, 0.98), ("quantalux", 45, 0.86),
-        ("imx477", 33.4, 0.88), ("imx477", 45, 0.73), ("ov9281", 33.4, 0.46), ("ov9281", 45, 0.28),
+        ("imx296", 33.4, 0.72),
+        ("imx296", 45, 0.54),
+        ("quantalux", 33.4, 0.98),
+        ("quantalux", 45, 0.86),
+        ("imx477", 33.4, 0.88),
+        ("imx477", 45, 0.73),
+        ("ov9281", 33.4, 0.46),
+        ("ov9281", 45, 0.28),
     ],
-)  # fmt: skip
+)
 def test_the_captured_share_on_the_short_side(name: str, field: float, share: float) -> None:
     assert at_field(field, name).short.captured == pytest.approx(share, abs=0.006)
 
@@ -101,10 +107,16 @@ def test_the_half_caught_field_captures_half(name: str) -> None:
 @pytest.mark.parametrize(
     ("pupil_mm", "iris_um", "margin_mm", "half_field_deg"),
     [
-        (3, 3200, 0.40, 12.6), (4, 3200, 1.07, 17.4), (3, 1600, 1.20, 18.1), (4, 1600, 1.87, 20.9),
-        (5, 3200, 1.73, 20.4), (7.7, 3200, 3.53, 25.6), (5, 1600, 2.53, 23.0), (7.7, 1600, 4.33, 27.2),
+        (3, 3200, 0.40, 12.6),
+        (4, 3200, 1.07, 17.4),
+        (3, 1600, 1.20, 18.1),
+        (4, 1600, 1.87, 20.9),
+        (5, 3200, 1.73, 20.4),
+        (7.7, 3200, 3.53, 25.6),
+        (5, 1600, 2.53, 23.0),
+        (7.7, 1600, 4.33, 27.2),
     ],
-)  # fmt: skip
+)
 def test_the_margin_of_a_pupil(pupil_mm: float, iris_um: float, margin_mm: float, half_field_deg: float) -> None:
     """OPTICS.md 1.4."""
     optics = PATH.optics.model_copy(update={"iris_um": iris_um})

@@ -132,9 +132,10 @@ def test_a_psf_is_consistent_with_its_own_recording_and_no_wrong_psf_is(raw: str
     assert match(pixels, calibration, right) is Match.CONSISTENT
     found = {kind: match(pixels, calibration, wrong) for kind, wrong in orientations(right).items()}
     assert found == {
-        "mirrored left-right": Match.MIRRORED_LEFT_RIGHT, "mirrored up-down": Match.MIRRORED_UP_DOWN,
+        "mirrored left-right": Match.MIRRORED_LEFT_RIGHT,
+        "mirrored up-down": Match.MIRRORED_UP_DOWN,
         "rotated by 180": Match.ROTATED,
-    }  # fmt: skip
+    }
     assert match(pixels, calibration, shuffled(right)) is Match.FOREIGN
     for _, other in RECORDINGS:
         if other != psf:

@@ -66,11 +66,13 @@ def test_the_textbook_caustic_agrees_with_the_warp_and_its_signs() -> None:
 @pytest.mark.parametrize(
     "edge",
     [
-        FieldEdge(FIELD_DEG), FieldEdge(FIELD_DEG - 0.2), FieldEdge(FIELD_DEG, 0.08, -0.06),
+        FieldEdge(FIELD_DEG),
+        FieldEdge(FIELD_DEG - 0.2),
+        FieldEdge(FIELD_DEG, 0.08, -0.06),
         FieldEdge(FIELD_DEG, width_deg=1.0),
     ],
     ids=["exact", "0.2 deg too large", "off centre", "soft"],
-)  # fmt: skip
+)
 def test_sphere_and_field_edge_are_found_together(estimator: RefractionEstimator, edge: FieldEdge) -> None:
     """With the calibrated edge an edge that is 0.2 deg too large costs 0.8 dpt, and one soft over 1 deg more."""
     found = estimator.find(expose(Prescription(-2.5), edge))

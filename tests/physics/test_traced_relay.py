@@ -33,9 +33,15 @@ WITHOUT_RIMS = tuple(replace(one, clear_mm=inf) for one in RELAY.surfaces)
 
 @pytest.mark.parametrize(
     ("glass", "index"),
-    [("N-BK7", 1.51680), ("N-BAF10", 1.67003), ("N-SF11", 1.78472), ("SF10", 1.72825), ("E-BAF11", 1.66672),
-     ("fused silica", 1.45846)],
-)  # fmt: skip
+    [
+        ("N-BK7", 1.51680),
+        ("N-BAF10", 1.67003),
+        ("N-SF11", 1.78472),
+        ("SF10", 1.72825),
+        ("E-BAF11", 1.66672),
+        ("fused silica", 1.45846),
+    ],
+)
 def test_index_at_the_d_line_is_the_catalogues(glass: str, index: float) -> None:
     assert PATH.glass[glass].index(D_UM) == pytest.approx(index, abs=6e-6)
 
@@ -65,13 +71,18 @@ def test_a_thin_lens_curves_its_field_by_the_closed_form() -> None:
     """R_s = f / (1 + 1/n), R_t = f / (3 + 1/n) with the stop at the lens, in the limit of small angles."""
     assert PATH.layout is not None
     thin = PATH.lens["LB1761-A"].model_copy(update={"radii_mm": (25.9, -25.9), "thick_mm": (1e-6,)})
-    path = PATH.model_copy(update={"lens": {**PATH.lens, "LB1761-A": thin},
-                                   "layout": PATH.layout.model_copy(update={"pupil_to_eye_lens_mm": 0.0})})  # fmt: skip
+    path = PATH.model_copy(
+        update={
+            "lens": {**PATH.lens, "LB1761-A": thin},
+            "layout": PATH.layout.model_copy(update={"pupil_to_eye_lens_mm": 0.0}),
+        }
+    )
     index = PATH.glass["N-BK7"].index(0.55)
     focal_mm = 25.9 / 2 / (index - 1)
     found = retina_point(path, 0.5, inf)
-    for vergence, radius_mm in zip((found.sagittal_dpt, found.tangential_dpt), petzval_mm(focal_mm, index),
-                                   strict=True):  # fmt: skip
+    for vergence, radius_mm in zip(
+        (found.sagittal_dpt, found.tangential_dpt), petzval_mm(focal_mm, index), strict=True
+    ):
         assert vergence == pytest.approx(1000 * found.height_mm**2 / (2 * radius_mm * focal_mm**2), rel=3e-4)
 
 
@@ -168,8 +179,10 @@ def test_the_displacement_lies_between_the_papers_formula_and_the_ideal_relay() 
     assert over_formula == pytest.approx(0.034, abs=5e-4)
     assert over_ideal == pytest.approx(-0.032, abs=5e-4)
     assert displacement_error(RELAY, 16.7)[0] == pytest.approx(0.012, abs=5e-4)
-    grown = [by * (extent_mm(Relay(), 50) - 3.2) / extent_mm(Relay(), 50) for by in (tan(radians(25)) / radians(25) - 1,
-                                                                                    over_formula)]  # fmt: skip
+    grown = [
+        by * (extent_mm(Relay(), 50) - 3.2) / extent_mm(Relay(), 50)
+        for by in (tan(radians(25)) / radians(25) - 1, over_formula)
+    ]
     assert grown == pytest.approx([0.038, 0.019], abs=5e-4)
     near, far = (tan(radians(RELAY.angle_behind_deg(angle))) for angle in (0.05, 25))
     assert far / near == pytest.approx(500 * (1 + over_formula), rel=1e-6), "the paper's formula is linear in the angle"
@@ -195,8 +208,11 @@ def test_rays_that_miss_or_are_totally_reflected_are_errors() -> None:
         rays(np.array([[0, np.nan, 0]]), np.array([0, 0, 1.0]))
     with pytest.raises(SpecError, match="no focus"):
         paraxial([Surface(0.0, inf, 1.5), Surface(3.0, inf, 1.0)])
-    assert not len(trace(moved([Surface(0.0, 5.0, 1.5, clear_mm=2.0)], 3.0),
-                         rays(np.array([[0, 1.1, 0]]), np.array([0, 0, 1.0]))).numbers)  # fmt: skip
+    assert not len(
+        trace(
+            moved([Surface(0.0, 5.0, 1.5, clear_mm=2.0)], 3.0), rays(np.array([[0, 1.1, 0]]), np.array([0, 0, 1.0]))
+        ).numbers
+    )
 
 
 def _without(table: str, name: str) -> LightPath:

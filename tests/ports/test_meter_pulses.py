@@ -63,9 +63,13 @@ def test_the_ring_shines_at_the_permitted_level_and_half_of_the_time(spec):
 def test_a_killed_command_leaves_no_light(spec, tmp_path):
     command = [sys.executable, "-c", "from services.cli import main; main()", "meter", "--data", str(tmp_path / "data")]
     with subprocess.Popen(
-        [*command, "--head", str(tmp_path / "head.toml")], cwd=ROOT, env=os.environ.copy(),
-        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-    ) as process:  # fmt: skip
+        [*command, "--head", str(tmp_path / "head.toml")],
+        cwd=ROOT,
+        env=os.environ.copy(),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    ) as process:
         assert process.stdin is not None
         assert process.stderr is not None
         process.stdin.write(b"y\n")

@@ -92,9 +92,13 @@ class TiffWriter:
                         part = np.pad(part, ((0, height - part.shape[0]), (0, width - part.shape[1]), (0, 0)))
                     parts.append(self.packed(part))
         tags: Tags = {
-            256: ("I", (cols,)), 257: ("I", (rows,)), 258: ("H", (self.bits,) * samples),
-            259: ("H", (self.compression,)), 277: ("H", (samples,)), 284: ("H", (2 if self.planar else 1,)),
-        }  # fmt: skip
+            256: ("I", (cols,)),
+            257: ("I", (rows,)),
+            258: ("H", (self.bits,) * samples),
+            259: ("H", (self.compression,)),
+            277: ("H", (samples,)),
+            284: ("H", (2 if self.planar else 1,)),
+        }
         tags |= {322: ("I", (width,)), 323: ("I", (height,))} if self.tile else {278: ("I", (height,))}
         if self.kind != "u":
             tags[339] = ("H", ({"i": 2, "f": 3, "c": 6}[self.kind],) * samples)
@@ -177,10 +181,15 @@ def stored(upright: Pixels, orientation: int) -> Pixels:
     """Return the pixels that a file with this orientation stores of an upright image."""
     # the transposition of Pillow that shows the image upright is undone by its inverse
     inverse: dict[int, Callable[[Pixels], Pixels]] = {
-        1: lambda a: a, 2: lambda a: a[:, ::-1], 3: lambda a: a[::-1, ::-1], 4: lambda a: a[::-1],
-        5: lambda a: a.swapaxes(0, 1), 6: lambda a: np.rot90(a, 1), 7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
+        1: lambda a: a,
+        2: lambda a: a[:, ::-1],
+        3: lambda a: a[::-1, ::-1],
+        4: lambda a: a[::-1],
+        5: lambda a: a.swapaxes(0, 1),
+        6: lambda a: np.rot90(a, 1),
+        7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
         8: lambda a: np.rot90(a, -1),
-    }  # fmt: skip
+    }
     return np.ascontiguousarray(inverse[orientation](upright))
 
 
@@ -328,21 +337,31 @@ def without_codec(draft: Draft) -> None:
 
 
 REFUSED: dict[str, tuple[str, Callable[[Draft], None]]] = {
-    "jpeg": ("compressed by JPEG", tagged(259, "H", 7)), "old jpeg": ("compressed by OJPEG", tagged(259, "H", 6)),
-    "fax": ("compressed by CCITTFAX4", tagged(259, "H", 4)), "webp": ("compressed by WEBP", tagged(259, "H", 50001)),
+    "jpeg": ("compressed by JPEG", tagged(259, "H", 7)),
+    "old jpeg": ("compressed by OJPEG", tagged(259, "H", 6)),
+    "fax": ("compressed by CCITTFAX4", tagged(259, "H", 4)),
+    "webp": ("compressed by WEBP", tagged(259, "H", 50001)),
     "jpeg 2000": ("compressed by", tagged(259, "H", 34712)),
     "unknown codec": ("compression 60000", tagged(259, "H", 60000)),
-    "transparent": ("transparent", channel(2)), "unspecified channel": ("SamplesPerPixel", channel(0)),
-    "complex": ("complex", typed("c", 64, np.complex64)), "24 bits": ("24 bits", tagged(258, "H", 24)),
-    "one bit": ("one bit", tagged(258, "H", 1)), "signed min-is-white": ("MINISWHITE", signed_white_is_zero),
+    "transparent": ("transparent", channel(2)),
+    "unspecified channel": ("SamplesPerPixel", channel(0)),
+    "complex": ("complex", typed("c", 64, np.complex64)),
+    "24 bits": ("24 bits", tagged(258, "H", 24)),
+    "one bit": ("one bit", tagged(258, "H", 1)),
+    "signed min-is-white": ("MINISWHITE", signed_white_is_zero),
     "transfer function": ("TransferFunction", tagged(301, "H", *range(256))),
     "grey response": ("GrayResponseCurve", tagged(291, "H", *range(256))),
-    "cmyk": ("SEPARATED", inks), "lab": ("CIELAB", tagged(262, "H", 8)),
-    "ycbcr": ("YCBCR", tagged(262, "H", 6)), "orientation 9": ("orientation 9", tagged(274, "H", 9)),
-    "depth": ("ImageDepth", tagged(32997, "I", 3)), "missing value": ("GDAL_NODATA", tagged(42113, "s", *b"20\0")),
-    "only a preview": ("reduced resolution", tagged(254, "I", 1)), "mask": ("transparency mask", second_page(kind=4)),
-    "two sizes": ("different sizes", second_page()), "predictor alone": ("predictor 2", without_codec),
-}  # fmt: skip
+    "cmyk": ("SEPARATED", inks),
+    "lab": ("CIELAB", tagged(262, "H", 8)),
+    "ycbcr": ("YCBCR", tagged(262, "H", 6)),
+    "orientation 9": ("orientation 9", tagged(274, "H", 9)),
+    "depth": ("ImageDepth", tagged(32997, "I", 3)),
+    "missing value": ("GDAL_NODATA", tagged(42113, "s", *b"20\0")),
+    "only a preview": ("reduced resolution", tagged(254, "I", 1)),
+    "mask": ("transparency mask", second_page(kind=4)),
+    "two sizes": ("different sizes", second_page()),
+    "predictor alone": ("predictor 2", without_codec),
+}
 
 
 def refused_tiff(rng: np.random.Generator) -> Encoded:
@@ -367,8 +386,11 @@ def random_dng(rng: np.random.Generator) -> Encoded:
     black, white = int(rng.integers(0, 300)), int(draft.meant.max()) + int(rng.integers(1, 50))
     draft.stored = draft.meant[..., None]
     draft.tags |= {
-        262: ("H", (34892,)), 50706: ("B", (1, 4, 0, 0)), 50714: ("2I", (2 * black, 2)), 50717: ("I", (white,))
-    }  # fmt: skip
+        262: ("H", (34892,)),
+        50706: ("B", (1, 4, 0, 0)),
+        50714: ("2I", (2 * black, 2)),
+        50717: ("I", (white,)),
+    }
     for apply in (turned, cropped, with_margins, black_of_sites, tabled):
         if rng.random() < 0.5:
             apply(draft)
@@ -429,21 +451,31 @@ def tabled(draft: Draft) -> None:
 REFUSED_DNG: dict[str, tuple[str, Callable[[Draft], None]]] = {
     "lossless jpeg": ("compressed by JPEG", tagged(259, "H", 7)),
     "lossy jpeg": ("compressed by", tagged(259, "H", 34892)),
-    "quad mosaic": ("CFARepeatPatternDim 4 x 4", lambda draft: draft.tags.update(
-        {262: ("H", (32803,)), 33421: ("H", (4, 4)), 33422: ("B", (0, 0, 1, 1) * 2 + (1, 1, 2, 2) * 2)})),
-    "filters of other colours": ("CFAPattern", lambda draft: draft.tags.update(
-        {262: ("H", (32803,)), 33421: ("H", (2, 2)), 33422: ("B", (3, 4, 5, 1))})),
-    "layout": ("CFALayout", tagged(50711, "H", 2)), "scale": ("DefaultScale", tagged(50718, "2I", 2, 1, 1, 1)),
+    "quad mosaic": (
+        "CFARepeatPatternDim 4 x 4",
+        lambda draft: draft.tags.update(
+            {262: ("H", (32803,)), 33421: ("H", (4, 4)), 33422: ("B", (0, 0, 1, 1) * 2 + (1, 1, 2, 2) * 2)}
+        ),
+    ),
+    "filters of other colours": (
+        "CFAPattern",
+        lambda draft: draft.tags.update({262: ("H", (32803,)), 33421: ("H", (2, 2)), 33422: ("B", (3, 4, 5, 1))}),
+    ),
+    "layout": ("CFALayout", tagged(50711, "H", 2)),
+    "scale": ("DefaultScale", tagged(50718, "2I", 2, 1, 1, 1)),
     "opcodes": ("OpcodeList2", tagged(51009, "B", 0, 0, 0, 1, 0, 0, 0, 9)),
     "zero white": ("WhiteLevel", tagged(50717, "I", 0)),
-    "white below black": ("below the BlackLevel", lambda draft: draft.tags.update(
-        {50714: ("I", (900,)), 50717: ("I", (800,))})),
+    "white below black": (
+        "below the BlackLevel",
+        lambda draft: draft.tags.update({50714: ("I", (900,)), 50717: ("I", (800,))}),
+    ),
     "area outside": ("ActiveArea", tagged(50829, "I", 0, 0, 900, 900)),
     "half a pixel": ("DefaultCropOrigin", tagged(50719, "2I", 1, 2, 3, 1)),
     "blacks that do not fit": ("BlackLevel", tagged(50714, "I", 1, 2, 3)),
     "user crop": ("DefaultUserCrop", tagged(51125, "2I", 0, 1, 0, 1, 1, 2, 1, 1)),
-    "interleaved": ("RowInterleaveFactor", tagged(50975, "I", 2)), "grey only": ("no raw image", tagged(262, "H", 1)),
-}  # fmt: skip
+    "interleaved": ("RowInterleaveFactor", tagged(50975, "I", 2)),
+    "grey only": ("no raw image", tagged(262, "H", 1)),
+}
 
 
 def refused_dng(rng: np.random.Generator) -> Encoded:
@@ -510,14 +542,17 @@ def random_png(rng: np.random.Generator) -> Encoded:
 
 
 REFUSED_PNG: dict[str, tuple[str, int, int, dict[bytes, bytes]]] = {  # the word, depth, colour type and chunks
-    "gamma": ("gAMA", 8, 0, {b"gAMA": struct.pack(">I", 45455)}), "srgb": ("sRGB", 8, 0, {b"sRGB": b"\0"}),
-    "animation": ("acTL", 8, 0, {b"acTL": struct.pack(">II", 2, 0)}), "one bit": ("one bit", 1, 0, {}),
+    "gamma": ("gAMA", 8, 0, {b"gAMA": struct.pack(">I", 45455)}),
+    "srgb": ("sRGB", 8, 0, {b"sRGB": b"\0"}),
+    "animation": ("acTL", 8, 0, {b"acTL": struct.pack(">II", 2, 0)}),
+    "one bit": ("one bit", 1, 0, {}),
     "16 bits with alpha": ("16 bits with an alpha channel", 16, 6, {}),
     "grey and alpha of 16 bits": ("16 bits with an alpha channel", 16, 4, {}),
-    "transparent": ("transparent", 8, 6, {}), "key colour": ("transparent", 16, 0, {b"tRNS": b"\x12\x34"}),
+    "transparent": ("transparent", 8, 6, {}),
+    "key colour": ("transparent", 16, 0, {b"tRNS": b"\x12\x34"}),
     "transparent palette": ("transparent", 8, 3, {b"PLTE": bytes(range(256)) * 3, b"tRNS": b"\0" * 256}),
     "orientation 9": ("orientation 9", 8, 0, {b"eXIf": exif(9)}),
-}  # fmt: skip
+}
 
 
 def refused_png(rng: np.random.Generator) -> Encoded:
@@ -563,9 +598,18 @@ def _array_file(
 
 
 WRITERS = (
-    random_tiff, random_tiff, random_tiff, refused_tiff, random_dng, random_dng, refused_dng, random_png, refused_png,
-    random_array, refused_array,
-)  # fmt: skip
+    random_tiff,
+    random_tiff,
+    random_tiff,
+    refused_tiff,
+    random_dng,
+    random_dng,
+    refused_dng,
+    random_png,
+    refused_png,
+    random_array,
+    refused_array,
+)
 
 
 def encoded_images(seed: int, n: int) -> Iterator[Encoded]:

@@ -69,12 +69,30 @@ SEQUENCES_PER_STORE = 25  # a start of the exam reads the latest captures
 EXPOSING = (ExamState.EXPOSING, ExamState.MAKING_EXPOSING)
 TINY = {"rows": 34, "cols": 60, "pitch_um": 161.28}
 FAULTS = (
-    ("camera.missing",), ("camera.stalled",), ("light.fault",), ("light.silent",), ("eye.closed",),
+    ("camera.missing",),
+    ("camera.stalled",),
+    ("light.fault",),
+    ("light.silent",),
+    ("eye.closed",),
     ("camera.missing", "bus.silent", "light.fault"),  # the head is lost
-)  # fmt: skip
+)
 TRIGGERS = ("time", "idle", "state", "stage", "verdict", "kept", "failed")
-ACTIONS = ("press", "repeat", "cancel", "take lease", "release lease", "fault", "repair", "disk", "consent", "aim",
-           "useless frames", "unexpected", "kill", "close")  # fmt: skip
+ACTIONS = (
+    "press",
+    "repeat",
+    "cancel",
+    "take lease",
+    "release lease",
+    "fault",
+    "repair",
+    "disk",
+    "consent",
+    "aim",
+    "useless frames",
+    "unexpected",
+    "kill",
+    "close",
+)
 
 
 @dataclass(frozen=True)
@@ -218,9 +236,14 @@ class TinyReconstructor:
         yield Reconstruction(_picture(counts), Report("gradient", rounds=ROUNDS), simulated)
 
     def __call__(
-        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
+        self,
+        counts: Pixels,
+        dark: Pixels | None = None,
+        *,
+        simulated: bool = False,
+        deadline: Deadline | None = None,
         quick: bool = False,
-    ) -> Reconstruction:  # fmt: skip
+    ) -> Reconstruction:
         if self._conditions.is_frame_useless:
             raise FrameError("too many pixels are missing")
         self._clock.sleep(0.02)
@@ -301,9 +324,17 @@ class Run:
         )
         self.resumed = [one.press.future for one in resumed]
         return ExamParts(
-            head, bench.store, clock, watchdog, lambda: BUDGET_S, self.requests,
-            ExamEvents(self.event_bus, watchdog, progress, self.requests), journal, monitor, resumed,
-        )  # fmt: skip
+            head,
+            bench.store,
+            clock,
+            watchdog,
+            lambda: BUDGET_S,
+            self.requests,
+            ExamEvents(self.event_bus, watchdog, progress, self.requests),
+            journal,
+            monitor,
+            resumed,
+        )
 
     def play(self) -> None:
         """Run the exam until it has ended, and check the rules for its end."""
@@ -542,10 +573,11 @@ class Sequences:
         conditions = Conditions()
         store = self.undo.enter_context(
             CaptureStore(
-                self.folder / f"store-{self.count}", reserve_bytes=0,
+                self.folder / f"store-{self.count}",
+                reserve_bytes=0,
                 free_bytes=lambda _: 0 if conditions.is_disk_full else 10**9,
             )
-        )  # fmt: skip
+        )
         return Bench(*self.template, store, conditions)
 
 
@@ -563,9 +595,13 @@ def run(count: int) -> Sequences:
     with sequences() as one:
 
         @settings(
-            max_examples=count, deadline=None, database=None, print_blob=False,
-            phases=(Phase.generate, Phase.shrink), suppress_health_check=list(HealthCheck),
-        )  # fmt: skip
+            max_examples=count,
+            deadline=None,
+            database=None,
+            print_blob=False,
+            phases=(Phase.generate, Phase.shrink),
+            suppress_health_check=list(HealthCheck),
+        )
         @given(SEQUENCE)
         def play(actions: list[Action]) -> None:
             violations = one.play(actions)

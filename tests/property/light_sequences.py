@@ -53,8 +53,12 @@ SHARES = {
 SMALL = LIMITS.model_copy(update={"photochemical_dose": DOSE.model_copy(update=SHARES)})  # limits that a test can reach
 COLOURS: tuple[Colour, ...] = ("red", "blue")  # that a press may take beside its green frames
 MODES: tuple[tuple[int, tuple[Colour, ...]], ...] = (
-    (1, ()), (4, ()), (4, ("red",)), (4, ("red", "blue")), (16, ("red",)),
-)  # fmt: skip
+    (1, ()),
+    (4, ()),
+    (4, ("red",)),
+    (4, ("red", "blue")),
+    (16, ("red",)),
+)
 SPEC = InstrumentSpec.model_validate(tomllib.loads(small_head_toml("small")))
 CALIBRATION = Calibration((Psf(np.ones((2, 2), np.float32)),), Sensor())
 
@@ -280,9 +284,12 @@ class Eyes(RuleBasedStateMachine):
         self.open_context = None
 
     @rule(
-        colour=st.sampled_from(sorted(BEAMS)), eye=st.sampled_from(EYES), pairs=st.integers(1, 12),
-        rest_s=st.floats(30, 90), in_visit=st.booleans(),
-    )  # fmt: skip
+        colour=st.sampled_from(sorted(BEAMS)),
+        eye=st.sampled_from(EYES),
+        pairs=st.integers(1, 12),
+        rest_s=st.floats(30, 90),
+        in_visit=st.booleans(),
+    )
     def expose_repeatedly(self, colour: Any, eye: Eye, pairs: int, rest_s: float, in_visit: bool) -> None:
         """Repeat exposures of the longest duration."""
         for _ in range(pairs):
@@ -295,9 +302,13 @@ class Eyes(RuleBasedStateMachine):
 
     @precondition(lambda self: self.open_context is None)
     @rule(
-        colours=st.lists(st.sampled_from(sorted(BEAMS)), min_size=1, max_size=3), eye=st.sampled_from(EYES),
-        count=st.integers(1, 16), exposure_s=st.floats(0.01, 10), slow=st.floats(1, 3), in_visit=st.booleans(),
-    )  # fmt: skip
+        colours=st.lists(st.sampled_from(sorted(BEAMS)), min_size=1, max_size=3),
+        eye=st.sampled_from(EYES),
+        count=st.integers(1, 16),
+        exposure_s=st.floats(0.01, 10),
+        slow=st.floats(1, 3),
+        in_visit=st.booleans(),
+    )
     def take_bursts(
         self, colours: list[Any], eye: Eye, count: int, exposure_s: float, slow: float, in_visit: bool
     ) -> None:
@@ -314,15 +325,30 @@ class Eyes(RuleBasedStateMachine):
 
     @precondition(lambda self: self.open_context is None)
     @rule(
-        eye=st.sampled_from(EYES), count=st.integers(1, 16), colours=st.lists(st.sampled_from(COLOURS), unique=True),
-        exposure_s=st.floats(0.01, 3), slow=st.floats(1, 3), in_visit=st.booleans(),
-        parts=st.integers(1, 8), overhead_share=st.floats(0, 0.5),
-        kill_at=st.one_of(st.none(), st.integers(0, 18)), afterglow_s=st.floats(0, AFTERGLOW_S),
-    )  # fmt: skip
+        eye=st.sampled_from(EYES),
+        count=st.integers(1, 16),
+        colours=st.lists(st.sampled_from(COLOURS), unique=True),
+        exposure_s=st.floats(0.01, 3),
+        slow=st.floats(1, 3),
+        in_visit=st.booleans(),
+        parts=st.integers(1, 8),
+        overhead_share=st.floats(0, 0.5),
+        kill_at=st.one_of(st.none(), st.integers(0, 18)),
+        afterglow_s=st.floats(0, AFTERGLOW_S),
+    )
     def press(
-        self, eye: Eye, count: int, colours: list[Colour], exposure_s: float, slow: float, in_visit: bool,
-        parts: int, overhead_share: float, kill_at: int | None, afterglow_s: float,
-    ) -> None:  # fmt: skip
+        self,
+        eye: Eye,
+        count: int,
+        colours: list[Colour],
+        exposure_s: float,
+        slow: float,
+        in_visit: bool,
+        parts: int,
+        overhead_share: float,
+        kill_at: int | None,
+        afterglow_s: float,
+    ) -> None:
         """Expose as a press does: a dark frame, a burst in green, other colours; a kill may come in any of them.
 
         Exposures are split as for an overhead of `overhead_share` of a part, which is not that of the camera.
@@ -345,9 +371,11 @@ class Eyes(RuleBasedStateMachine):
 
     @precondition(lambda self: self.open_context is None)
     @rule(
-        eyes=st.sampled_from([("OD",), ("OS",), ("OD", "OS")]), pictures=st.integers(1, 40),
-        exposure_s=st.floats(0.01, 0.2), in_visit=st.booleans(),
-    )  # fmt: skip
+        eyes=st.sampled_from([("OD",), ("OS",), ("OD", "OS")]),
+        pictures=st.integers(1, 40),
+        exposure_s=st.floats(0.01, 0.2),
+        in_visit=st.booleans(),
+    )
     def aim(self, eyes: tuple[Eye, ...], pictures: int, exposure_s: float, in_visit: bool) -> None:
         """Take live pictures, until one is refused."""
         self.exposed_eyes, self.in_visit = eyes, in_visit

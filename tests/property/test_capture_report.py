@@ -18,14 +18,26 @@ from tests.earlier import store_of_version
 
 # Keys of the reports of each release on `main`, with a value as that release wrote it.
 SOLVER = {
-    "method": "variation", "bin": 1, "rounds": 12, "stopped": "done", "seconds": {"expose": 0.2, "solve": 0.5},
-    "psf_index": 0, "psf_scale": 1.0, "refraction_dpt": {"sphere": -1.25, "sd": 0.5}, "regularisation": {"tau": 1e-3},
-    "noise_dn": 9.5, "residual": 0.84, "quality": {"coverage": 0.98, "resolution_um": None}, "warnings": ["dim"],
-}  # fmt: skip
+    "method": "variation",
+    "bin": 1,
+    "rounds": 12,
+    "stopped": "done",
+    "seconds": {"expose": 0.2, "solve": 0.5},
+    "psf_index": 0,
+    "psf_scale": 1.0,
+    "refraction_dpt": {"sphere": -1.25, "sd": 0.5},
+    "regularisation": {"tau": 1e-3},
+    "noise_dn": 9.5,
+    "residual": 0.84,
+    "quality": {"coverage": 0.98, "resolution_um": None},
+    "warnings": ["dim"],
+}
 LIGHT = {
-    "dose_j_per_cm2": 9.9e-6, "dose_24h_j_per_cm2": {"OD": 9.9e-6, "OS": 0}, "dose_stop_j_per_cm2": 0.1584,
+    "dose_j_per_cm2": 9.9e-6,
+    "dose_24h_j_per_cm2": {"OD": 9.9e-6, "OS": 0},
+    "dose_stop_j_per_cm2": 0.1584,
     "dose_high": [],
-}  # fmt: skip
+}
 VISIT = {"visit": "20260302T120000-ddeeba", "slot": "R-centre"}
 VERDICT = {"verdict": {"word": "again", "code": "shot.moved", "numbers": {"smear": 0.4339, "residual": None}}}
 LATERALITY = {"test": False, "laterality": {"eye": "OS", "confidence": 0.99, "disc": [10.5, 20]}, "budget_s": 5.0}
@@ -39,13 +51,28 @@ FRAMES = {
 }
 ORIGIN = {
     "device": {
-        "uuid": "5cfb0f4e-7a59-4c36-9d8b-6f4c6f1a2b3c", "serial": "10000000a1b2c3d4", "software": "0.2.0",
-        "head": "Simulated head", "calibration_id": "81d7eff650299a58", "calibrated_at": None, "clock": "not_set",
+        "uuid": "5cfb0f4e-7a59-4c36-9d8b-6f4c6f1a2b3c",
+        "serial": "10000000a1b2c3d4",
+        "software": "0.2.0",
+        "head": "Simulated head",
+        "calibration_id": "81d7eff650299a58",
+        "calibrated_at": None,
+        "clock": "not_set",
     },
-}  # fmt: skip
+}
 FIGURES = (
-    "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
-)  # fmt: skip
+    "sphere",
+    "sd",
+    "j0",
+    "j0_sd",
+    "j45",
+    "j45_sd",
+    "sphere_sc",
+    "cylinder",
+    "axis_deg",
+    "field_deg",
+    "field_deg_sd",
+)
 CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
 WARPED = {
     "psf_cylinder": {"j0_dpt": -1.0, "j45_dpt": 0.25, "gain_db": None},
@@ -59,12 +86,16 @@ BALANCED = {
 }
 REFUSED = {"refraction_dpt": dict.fromkeys(FIGURES) | {"refused": "no structure"}}
 RELEASES: list[dict[str, Any]] = [
-    SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,
-    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
+    SOLVER,
+    SOLVER | LIGHT,
+    SOLVER | LIGHT | VISIT,
+    SOLVER | LIGHT | VISIT | VERDICT,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | REFUSED,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN | CYLINDER,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN | CYLINDER | WARPED | BALANCED,
-]  # fmt: skip
+]
 KEYS = sorted(RELEASES[-1])
 
 texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)

@@ -24,9 +24,11 @@ def test_a_failure_of_the_lamps_last_off_during_a_suspended_refinement_loses_no_
 
     lamp = exam_sequences.FAULTS.index(("light.silent",))
     script = [
-        act("idle", "press"), act("time", "press", delay_s=0.6), act("verdict", "fault", choice=lamp),
+        act("idle", "press"),
+        act("time", "press", delay_s=0.6),
+        act("verdict", "fault", choice=lamp),
         act("failed", "repair"),
-    ]  # fmt: skip
+    ]
     with exam_sequences.sequences() as one:
         assert one.play(script) == []
     assert (one.done["accepted"], one.done["stored"]) == (2, 1)

@@ -22,9 +22,13 @@ E_PER_UM2 = 0.28 * 1000 / 5.04**2  # mean light of frames whose brightest pixel 
 # Photograph HRF 14_h: thousands of electrons in the brightest pixel, motion in pixels over the light, PSNR of one
 # exposure, of 4 and of 8 frames that share the light.
 MEASURED = [
-    (20, 0, (33.30, 33.27, 33.23)), (20, 4, (32.68, 33.17, 33.25)), (20, 11, (31.89, 32.43, 32.66)),
-    (2, 0, (30.41, 30.25, 30.10)), (2, 3, (30.28, 30.22, 29.97)), (2, 12, (29.31, 30.05, 29.94)),
-]  # fmt: skip
+    (20, 0, (33.30, 33.27, 33.23)),
+    (20, 4, (32.68, 33.17, 33.25)),
+    (20, 11, (31.89, 32.43, 32.66)),
+    (2, 0, (30.41, 30.25, 30.10)),
+    (2, 3, (30.28, 30.22, 29.97)),
+    (2, 12, (29.31, 30.05, 29.94)),
+]
 
 counts = st.integers(1, 6)
 exposures_s = st.floats(0.005, 0.5)

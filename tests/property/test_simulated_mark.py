@@ -479,9 +479,19 @@ WRITERS = {
     "services/records/frame_writer.py _write": CAPTURE,
 }
 ENCODERS = {
-    "png_bytes", "jpeg_bytes", "tiff_bytes", "write_npy", "write_side_file", "write_linear", "to_png",
-    "to_jpeg", "counts_jpeg", "raw_tiff", "write_picture", "with_note",
-}  # fmt: skip
+    "png_bytes",
+    "jpeg_bytes",
+    "tiff_bytes",
+    "write_npy",
+    "write_side_file",
+    "write_linear",
+    "to_png",
+    "to_jpeg",
+    "counts_jpeg",
+    "raw_tiff",
+    "write_picture",
+    "with_note",
+}
 FOREIGN = {"imwrite", "imsave", "savefig", "fromarray", "savez", "savez_compressed", "ZipFile"}  # and np.save
 NO_PICTURES = {
     "device/calibration/archive.py _npy": "manifest.toml states the mark",
@@ -537,21 +547,63 @@ def test_pictures_are_encoded_by_the_module_of_the_mark_only() -> None:
 
 
 COMMANDS = {  # commands that write pictures; the others print, draw plots, or move files that are written already
-    "reconstruct", "montage", "frame", "calibrate", "simulate", "frontier", "data", "bench", "paper", "hard",
-    "calibrations export", "calibrations import", "calibrations import-psf", "archive run", "archive report",
-    "archive adopt", "run",
-}  # fmt: skip
+    "reconstruct",
+    "montage",
+    "frame",
+    "calibrate",
+    "simulate",
+    "frontier",
+    "data",
+    "bench",
+    "paper",
+    "hard",
+    "calibrations export",
+    "calibrations import",
+    "calibrations import-psf",
+    "archive run",
+    "archive report",
+    "archive adopt",
+    "run",
+}
 OTHER_COMMANDS = {
-    "health", "probe", "doctor", "meter", "light", "trial-lenses", "white-card", "check", "chart", "optics", "methods",
-    "calibrations list", "calibrations show", "calibrations use", "calibrations new-key", "update check",
-    "update install", "update restart", "update settle", "update answer", "update tidy", "update status",
-    "snapshots list", "snapshots restore", "store check", "store rebuild", "store backup", "store restore",
+    "health",
+    "probe",
+    "doctor",
+    "meter",
+    "light",
+    "trial-lenses",
+    "white-card",
+    "check",
+    "chart",
+    "optics",
+    "methods",
+    "calibrations list",
+    "calibrations show",
+    "calibrations use",
+    "calibrations new-key",
+    "update check",
+    "update install",
+    "update restart",
+    "update settle",
+    "update answer",
+    "update tidy",
+    "update status",
+    "snapshots list",
+    "snapshots restore",
+    "store check",
+    "store rebuild",
+    "store backup",
+    "store restore",
     "archive plan",
-}  # fmt: skip
+}
 ENDPOINTS = {
-    "/api/calibration/preview", "/api/captures/{id}/{name}", "/api/preview", "/api/technician/captures/{id}/again.png",
-    "/api/visits/{id}/export.zip", "/api/visits/{id}/montage/{eye}/picture.png",
-}  # fmt: skip
+    "/api/calibration/preview",
+    "/api/captures/{id}/{name}",
+    "/api/preview",
+    "/api/technician/captures/{id}/again.png",
+    "/api/visits/{id}/export.zip",
+    "/api/visits/{id}/montage/{eye}/picture.png",
+}
 
 
 def test_every_command_and_every_endpoint_is_listed() -> None:

@@ -79,21 +79,31 @@ def test_the_published_example_of_the_check_digit() -> None:
 
 taken = st.builds(
     lambda name, word: SlotCapture(name, None if word is None else PictureVerdict(word)),
-    st.from_regex("[a-z]{8}", fullmatch=True), st.sampled_from(["good", "again", None]),
-)  # fmt: skip
+    st.from_regex("[a-z]{8}", fullmatch=True),
+    st.sampled_from(["good", "again", None]),
+)
 slot_states = st.lists(taken, max_size=4, unique_by=lambda one: one.capture).flatmap(
     lambda shots: st.builds(
-        SlotState, st.just(tuple(shots)),
-        st.one_of(st.none(), st.just(SlotDecision()), st.just(SlotDecision(reason="pupil")),
-                  *(st.just(SlotDecision(one.capture)) for one in shots)),
+        SlotState,
+        st.just(tuple(shots)),
+        st.one_of(
+            st.none(),
+            st.just(SlotDecision()),
+            st.just(SlotDecision(reason="pupil")),
+            *(st.just(SlotDecision(one.capture)) for one in shots),
+        ),
     )
-)  # fmt: skip
+)
 visits = st.fixed_dictionaries({slot.id: slot_states for slot in PROTOCOL.slots})
-fields = st.fixed_dictionaries({}, optional={
-    "consent": st.sampled_from(["agreed", "declined"]),
-    "complaints": st.none() | st.lists(st.sampled_from(["sudden_loss", "flashes", "pain", "red"]), unique=True),
-    "vision_od": st.none() | st.sampled_from(VISIONS), "vision_os": st.none() | st.sampled_from(VISIONS),
-})  # fmt: skip
+fields = st.fixed_dictionaries(
+    {},
+    optional={
+        "consent": st.sampled_from(["agreed", "declined"]),
+        "complaints": st.none() | st.lists(st.sampled_from(["sudden_loss", "flashes", "pain", "red"]), unique=True),
+        "vision_od": st.none() | st.sampled_from(VISIONS),
+        "vision_os": st.none() | st.sampled_from(VISIONS),
+    },
+)
 
 
 @given(fields, visits)
@@ -104,10 +114,16 @@ def test_the_outcome_follows_the_rules_in_order(answers: dict[str, Any], slots: 
     states = {id: slot.state for id, slot in slots.items()}
     is_missing = any({states[f"{side}-centre"], states[f"{side}-nerve"]} == {"empty"} for side in "RL")
     expected = (
-        "refer_today" if urgent else "refer_vision" if is_low
-        else "declined" if answers.get("consent") == "declined"
-        else "refer_picture" if is_missing or "could_not" in states.values() else "send"
-    )  # fmt: skip
+        "refer_today"
+        if urgent
+        else "refer_vision"
+        if is_low
+        else "declined"
+        if answers.get("consent") == "declined"
+        else "refer_picture"
+        if is_missing or "could_not" in states.values()
+        else "send"
+    )
     assert result.code == expected
     assert result.sentence.endswith(".")
     assert not {"normal", "disease", "healthy", "retinopathy", "glaucoma"} & set(result.sentence.lower().split())
@@ -145,14 +161,17 @@ def test_vision_at_the_limit_is_not_referred(vision: str) -> None:
 @pytest.mark.parametrize(
     ("right", "left", "sentence"),
     [
-        (("taken", "could_not"), ("empty", "empty"),
-         "Refer: not every picture of the right eye possible; picture of the left eye not taken."),
+        (
+            ("taken", "could_not"),
+            ("empty", "empty"),
+            "Refer: not every picture of the right eye possible; picture of the left eye not taken.",
+        ),
         (("could_not", "empty"), ("could_not", "could_not"), "Refer: picture of both eyes not possible."),
         (("taken", "taken"), ("could_not", "empty"), "Refer: picture of the left eye not possible."),
         (("taken", "empty"), ("taken", "taken"), "The pictures are kept, 1 not taken. They are for an eye specialist."),
         (("taken", "taken"), ("taken", "taken"), "The pictures are kept. They are for an eye specialist."),
     ],
-)  # fmt: skip
+)
 def test_untaken_and_impossible_pictures_have_different_sentences(
     right: tuple[str, str], left: tuple[str, str], sentence: str
 ) -> None:

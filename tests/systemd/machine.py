@@ -139,9 +139,10 @@ def installed(opt: Path) -> list[str]:
     compiled.mkdir(exist_ok=True)
     return [
         f"--bind={compiled}:/var/cache/private/diffuscope",
-        f"--bind-ro={opt}:/opt/diffuscope", f"--bind-ro={sys.base_prefix}:/opt/python",
+        f"--bind-ro={opt}:/opt/diffuscope",
+        f"--bind-ro={sys.base_prefix}:/opt/python",
         f"--bind-ro={here}:/opt/diffuscope/{packages.relative_to(opt)}",
-    ]  # fmt: skip
+    ]
 
 
 @contextmanager
@@ -190,9 +191,19 @@ def boot_until_power_cut(tree: Path, console: Path, when: Callable[[], bool], *m
 
 def _start_nspawn(tree: Path, console: Path, more: tuple[str, ...]) -> subprocess.Popen[bytes]:
     words = [
-        "systemd-nspawn", "--quiet", "-D", str(tree), "--boot", "--register=no", "--keep-unit", "--private-network",
-        "--volatile=overlay", "--console=pipe", "--machine=diffuscope-test", *more,
-    ]  # fmt: skip
+        "systemd-nspawn",
+        "--quiet",
+        "-D",
+        str(tree),
+        "--boot",
+        "--register=no",
+        "--keep-unit",
+        "--private-network",
+        "--volatile=overlay",
+        "--console=pipe",
+        "--machine=diffuscope-test",
+        *more,
+    ]
     with console.open("wb") as output:
         return subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
 

@@ -24,8 +24,13 @@ def calibration(black_dn: float = 64.25) -> Calibration:
     return Calibration(
         (Psf(speckle((17, 19)), "0 dpt"), Psf(speckle((17, 19), 3), "2 dpt", "red")),
         Sensor(black_dn, 5.7, 1.03, 4095.0),
-        Geometry(5.04, 6000, 0.75), 33.4, np.full(shape, 64.5, np.float32), flat, flat > 1.09, True,
-    )  # fmt: skip
+        Geometry(5.04, 6000, 0.75),
+        33.4,
+        np.full(shape, 64.5, np.float32),
+        flat,
+        flat > 1.09,
+        True,
+    )
 
 
 @pytest.fixture

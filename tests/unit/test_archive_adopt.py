@@ -36,20 +36,30 @@ def planned(store: Path, name: str) -> PlannedCapture:
         files = opened.get(name).files
     place = store / "captures" / name
     return PlannedCapture(
-        id=name, source=str(store), raw=str(place / "raw.tiff"), raw_sha256=files["raw.tiff"], calibration="c",
-        result=name.encode().hex().ljust(32, "0"), dark=str(place / "dark.tiff"), dark_sha256=files["dark.tiff"],
+        id=name,
+        source=str(store),
+        raw=str(place / "raw.tiff"),
+        raw_sha256=files["raw.tiff"],
+        calibration="c",
+        result=name.encode().hex().ljust(32, "0"),
+        dark=str(place / "dark.tiff"),
+        dark_sha256=files["dark.tiff"],
         origin=HERE,
-    )  # fmt: skip
+    )
 
 
 def write_results(
     folder: Path, captures: list[PlannedCapture], without: tuple[str, ...] = (), simulated: bool = True
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a folder of results: a picture of 6 x 8 pixels whose field is 4 x 6, and one in colour."""
     plan = Plan(
-        made_at="2026-01-01", sources=("a",), settings=PlanSettings(), software=software(), captures=tuple(captures),
+        made_at="2026-01-01",
+        sources=("a",),
+        settings=PlanSettings(),
+        software=software(),
+        captures=tuple(captures),
         calibrations=(PlannedCalibration(digest="c", label="c", files=()),),
-    )  # fmt: skip
+    )
     results, picture = ResultFolder(folder), np.arange(48, dtype=np.float32).reshape(6, 8) + 1
     folder.mkdir()
     results.prepare(plan)
@@ -79,9 +89,7 @@ def test_the_field_of_each_result_becomes_a_picture_with_its_marks(store: Path, 
     with CaptureStore(store, reserve_bytes=0) as kept:
         (version,) = kept.get("one").report.versions
         assert version.result == captures[0].result
-        picture, colour = (
-            Image.open(BytesIO(kept.read("one", name))) for name in (version.picture, version.colour)
-        )  # fmt: skip
+        picture, colour = (Image.open(BytesIO(kept.read("one", name))) for name in (version.picture, version.colour))
         assert (picture.size, picture.mode, colour.size, colour.mode) == ((6, 4), "L", (6, 4), "RGB")
         assert picture.info["simulated"] == "true"
         assert picture.info["note"] == "OD 2026-01-01, reconstructed again"
@@ -94,11 +102,12 @@ def test_the_field_of_each_result_becomes_a_picture_with_its_marks(store: Path, 
 def test_what_does_not_belong_to_the_store_is_refused_and_the_rest_adopted(store: Path, tmp_path: Path) -> None:
     first, second = (planned(store, name) for name in NAMES)
     captures = [
-        first, second.model_copy(update={"raw_sha256": "0" * 64}),
+        first,
+        second.model_copy(update={"raw_sha256": "0" * 64}),
         first.model_copy(update={"id": "three", "result": "3" * 32}),
         first.model_copy(update={"id": "four", "result": "4" * 32, "origin": ELSEWHERE}),
         first.model_copy(update={"result": "5" * 32, "origin": ELSEWHERE}),
-    ]  # fmt: skip
+    ]
     done = adopted(write_results(tmp_path / "out", captures), store)
     assert (done.adopted, [one.id for one in done.refused]) == (1, ["two", "three", "four", "one"])
     frames, unknown, foreign, of_another = (f"{one.reason}. {one.remedy}" for one in done.refused)

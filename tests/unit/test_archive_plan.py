@@ -132,10 +132,12 @@ def test_an_archive_of_none_is_a_plan(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rounds": 2, "budget_s": 1.0}, "limit the same"), ({"rounds": 0}, "cannot be run"),
-        ({"budget_s": -1.0}, "not a time"), ({"method": "magic"}, "no method"),
+        ({"rounds": 2, "budget_s": 1.0}, "limit the same"),
+        ({"rounds": 0}, "cannot be run"),
+        ({"budget_s": -1.0}, "not a time"),
+        ({"method": "magic"}, "no method"),
     ],
-)  # fmt: skip
+)
 def test_impossible_settings_are_refused(settings: dict[str, float | str], message: str, tmp_path: Path) -> None:
     (tmp_path / "captures").mkdir()
     with pytest.raises(SettingError, match=message):
@@ -151,10 +153,12 @@ def test_a_folder_that_is_no_source_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "format None"), ("format = 9", "format 9"), ("format = 1", "is no plan: made_at"),
+        ("", "format None"),
+        ("format = 9", "format 9"),
+        ("format = 1", "is no plan: made_at"),
         ("format = ", "not whole TOML"),
     ],
-)  # fmt: skip
+)
 def test_a_damaged_plan_is_refused(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "plan.toml"
     path.write_text(text)
@@ -174,8 +178,10 @@ def test_frames_of_one_name_are_one_capture_in_every_kind_of_folder(scene: Scene
     for place in (flat, pairs, scenes / "a"):
         tifffile.imwrite(place / "psf-red.tiff", scene.psf)
     for source, first, ids in (
-        (flat, "eye0", ["eye0", "eye0-4", "eye1"]), (pairs, "eye0", ["eye0", "eye0-4", "eye1"]), (scenes, "a", ["a"])
-    ):  # fmt: skip
+        (flat, "eye0", ["eye0", "eye0-4", "eye1"]),
+        (pairs, "eye0", ["eye0", "eye0-4", "eye1"]),
+        (scenes, "a", ["a"]),
+    ):
         plan = plan_of(source)
         assert [one.id for one in plan.captures] == ids
         frames = plan.captures[ids.index(first)].frames
@@ -197,8 +203,10 @@ def test_a_stored_burst_is_planned_whole_with_what_the_instrument_left_out(scene
             store.save(capture, files | {"raw.tiff": name.encode(), "report.json": b"{}"})
     (first, second) = plan_of(tmp_path).captures
     assert [(Path(one.path).name, one.colour, one.unusable) for one in first.frames] == [
-        ("raw-1.tiff", "", "frame quality: shot.moved"), ("raw-2.tiff", "", ""), ("raw-red.tiff", "red", "")
-    ]  # fmt: skip
+        ("raw-1.tiff", "", "frame quality: shot.moved"),
+        ("raw-2.tiff", "", ""),
+        ("raw-red.tiff", "red", ""),
+    ]
     assert first.origin == "here"
     assert first.result != second.result
     (tmp_path / "captures" / "b" / "raw-2.tiff").unlink()

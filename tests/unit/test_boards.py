@@ -30,8 +30,11 @@ def wrong_pads(name: str, drawn: Board) -> set[Pin]:
     expected = {pin: net for pin, net in nets.items() if (pin[0] in RING_PARTS) == (name == "ring")}
     expected |= {(plug, number): net for number, net in WIRES.items()}
     drawn_nets = {pin: pad.net for pin, pad in drawn.pads.items()}
-    return {pin for pin in expected.keys() | drawn_nets.keys()
-            if pin not in drawn_nets or pin not in expected or drawn_nets[pin] != expected[pin]}  # fmt: skip
+    return {
+        pin
+        for pin in expected.keys() | drawn_nets.keys()
+        if pin not in drawn_nets or pin not in expected or drawn_nets[pin] != expected[pin]
+    }
 
 
 @pytest.mark.parametrize("name", ["gate", "ring"])

@@ -117,9 +117,13 @@ def test_other_lines_of_autoboot_txt_stay(device: BootChooser) -> None:
 
 
 UNREADABLE = [
-    "", "[all]\n", "[all]\nboot_partition=7\n", "[all]\nboot_partition=x\n", "[all]\nboot_partition=2\n",
+    "",
+    "[all]\n",
+    "[all]\nboot_partition=7\n",
+    "[all]\nboot_partition=x\n",
+    "[all]\nboot_partition=2\n",
     f"#{'x' * SECTOR_BYTES}\n[all]\nboot_partition=2\n[tryboot]\nboot_partition=3\n",
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("content", UNREADABLE)

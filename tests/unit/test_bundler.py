@@ -45,8 +45,10 @@ def test_dynamic_import_path_is_relative_to_entry() -> None:
     }
     files = bundle_module("pages/app.js", modules.__getitem__)
     assert re.findall(r"import\((.*)\);", files["pages/app.js"]) == [
-        '"../core/b.js"', "`../i18n/${tag}.js`", '"./late.js"',
-    ]  # fmt: skip
+        '"../core/b.js"',
+        "`../i18n/${tag}.js`",
+        '"./late.js"',
+    ]
     assert files["core/a.js"].startswith('import { parts } from "../pages/app.js";')
 
 

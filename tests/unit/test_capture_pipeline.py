@@ -46,9 +46,15 @@ class Bench:
         exposure, verdict = self.pipeline.assess(self.pipeline.expose("OD"))
         press = Press(Future(), "OD", CaptureTarget(visit="v", slot="R-centre"), None)
         return ExposedCapture(
-            press, "20260101T000000-OD-000001", self.clock.wall(), exposure.lit, exposure.dark, exposure.duration_s,
-            light=self.head.light.dose_report(), verdict=verdict,
-        )  # fmt: skip
+            press,
+            "20260101T000000-OD-000001",
+            self.clock.wall(),
+            exposure.lit,
+            exposure.dark,
+            exposure.duration_s,
+            light=self.head.light.dose_report(),
+            verdict=verdict,
+        )
 
 
 @pytest.fixture
@@ -61,8 +67,9 @@ def bench(tmp_path: Path) -> Bench:
     light = GuardedLight(SimLight(world), clock, 30.0, hazard_of(spec), MemoryLedger(clock))
     head = Head(spec, SimCamera(world), light, simulated_calibration(world), present_eye=world.present_eye)
     reconstructor = TinyReconstructor(clock, conditions)
-    return Bench(world, clock, conditions, head, CapturePipeline(head, clock, reconstructor, reconstructor,
-                                                                 PlainFeedback()))  # fmt: skip
+    return Bench(
+        world, clock, conditions, head, CapturePipeline(head, clock, reconstructor, reconstructor, PlainFeedback())
+    )
 
 
 def test_an_exposure_is_a_lit_and_a_dark_frame_and_leaves_the_lamp_off(bench: Bench) -> None:
@@ -173,9 +180,14 @@ class MovingEye(PlainFeedback):
 
 def test_exposures_are_split_while_the_eye_moves_and_the_report_says_why(bench: Bench) -> None:
     pipeline = CapturePipeline(
-        bench.head, bench.clock, bench.pipeline.reconstructor, bench.pipeline.live, MovingEye(), bursts=NoBursts(),
+        bench.head,
+        bench.clock,
+        bench.pipeline.reconstructor,
+        bench.pipeline.live,
+        MovingEye(),
+        bursts=NoBursts(),
         colours=RedOnly(),
-    )  # fmt: skip
+    )
     first = pipeline.expose("OD", count=1, colours=["red"], split=pipeline.choose_split(1))
     assert [len(first.lit), split_notes(first.split)] == [1, ()], "the light of this eye is not known yet"
     pipeline.assess(first)
@@ -250,9 +262,13 @@ def test_a_colour_that_fails_leaves_the_lit_frames_and_its_reason(bench: Bench) 
 
 def test_a_colour_without_a_psf_is_not_lit_and_its_reason_kept(bench: Bench) -> None:
     with_colours = CapturePipeline(
-        bench.head, bench.clock, bench.pipeline.reconstructor, bench.pipeline.live, PlainFeedback(),
+        bench.head,
+        bench.clock,
+        bench.pipeline.reconstructor,
+        bench.pipeline.live,
+        PlainFeedback(),
         colours=NoColours(),
-    )  # fmt: skip
+    )
     exposure = with_colours.expose("OD", colours=["red"])
     assert (dict(exposure.colours), exposure.missing) == ({}, {"red": NO_PSF})
     assert bench.pipeline.expose("OD", colours=["red"]).missing == {}, "a pipeline of one colour by design"
@@ -266,10 +282,16 @@ class SeesLights(RedOnly):
         self.lights_dn_per_s: Mapping[Colour, float] = {}
 
     def steps(
-        self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
-        deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+        self,
+        green: Iterator[Step],
+        frames: Mapping[Colour, Pixels],
+        dark: Pixels | None = None,
+        *,
+        simulated: bool,
+        deadline: Deadline | None = None,
+        missing: Mapping[Colour, str] | None = None,
         lights_dn_per_s: Mapping[Colour, float] | None = None,
-    ) -> Iterator[Step]:  # fmt: skip
+    ) -> Iterator[Step]:
         self.lights_dn_per_s = lights_dn_per_s or {}
         return green
 

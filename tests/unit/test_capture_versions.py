@@ -53,8 +53,12 @@ def test_a_version_stands_beside_the_picture_as_taken(store: CaptureStore) -> No
     assert kept.report.versions == (first, second)
     assert kept.files.items() >= taken.files.items()
     assert set(kept.files) - set(taken.files) == {
-        "picture-1.png", "report-1.json", "picture-2.png", "colour-2.png", "report-2.json"
-    }  # fmt: skip
+        "picture-1.png",
+        "report-1.json",
+        "picture-2.png",
+        "colour-2.png",
+        "report-2.json",
+    }
     assert store.read(ID, first.picture) == b"new picture"
     assert store.read(ID, second.colour) == b"in colour"
     assert store.read(ID, "report.json") == b"{}"

@@ -87,8 +87,9 @@ def test_the_password_leaves_the_boot_partition(card: CardBoot) -> None:
     assert tomllib.loads(file.read_text())["wifi"]["password"] == "*" * len(PASSWORD)
     assert "# of the router" in file.read_text()
     assert files_with(card.root, PASSWORD) == [
-        "data/settings/diffuscope.toml", "run/NetworkManager/system-connections/wifi.nmconnection",
-    ]  # fmt: skip
+        "data/settings/diffuscope.toml",
+        "run/NetworkManager/system-connections/wifi.nmconnection",
+    ]
 
 
 def test_a_power_cut_before_the_stars_is_completed_by_the_next_boot(card: CardBoot) -> None:
@@ -104,19 +105,23 @@ def test_a_power_cut_before_the_stars_is_completed_by_the_next_boot(card: CardBo
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ("[wifi", "is not TOML"), (GOOD.replace("name", "nmae"), "did you mean 'wifi.name'|'wifi.nmae'"),
-        (GOOD.replace(PASSWORD, "short"), "8 to 63"), (GOOD.replace("ssh-ed25519", "-----BEGIN"), "id_ed25519.pub"),
+        ("[wifi", "is not TOML"),
+        (GOOD.replace("name", "nmae"), "did you mean 'wifi.name'|'wifi.nmae'"),
+        (GOOD.replace(PASSWORD, "short"), "8 to 63"),
+        (GOOD.replace("ssh-ed25519", "-----BEGIN"), "id_ed25519.pub"),
         (GOOD.replace("Kolkata", "Kalkutta"), "Asia/Kalkutta"),
-        (GOOD.replace("KE", "UK"), "'UK' is none"), (GOOD.replace("KE", "Kenya"), "country"),
+        (GOOD.replace("KE", "UK"), "'UK' is none"),
+        (GOOD.replace("KE", "Kenya"), "country"),
         (GOOD.replace("imx477", "imx999"), "no head file 'imx999.toml'.*imx296, imx296_power"),
         (f'programme = "mine.toml"\n{GOOD}', "mine.toml"),
         (GOOD.replace("Clinic", "Other").replace(PASSWORD, "*" * 10), "no password"),
         (GOOD.replace(PASSWORD, 'ga\\"ga 2026'), "removed"),
         ('wifi = { name = "Clinic", password = "ganga 2026" }', "removed"),
-        ("\x00\x01\x02", "diffuscope.toml"), (GOOD.replace("[ssh]", "[sshd]"), "sshd"),
+        ("\x00\x01\x02", "diffuscope.toml"),
+        (GOOD.replace("[ssh]", "[sshd]"), "sshd"),
         (GOOD.replace("imx477", "../../etc/shadow"), "head"),
     ],
-)  # fmt: skip
+)
 def test_nonsense_is_reported_and_the_kept_settings_stay(card: CardBoot, change: str, named: str) -> None:
     """It boots; console and page say why; nothing that was kept changes."""
     write(card, GOOD)

@@ -16,11 +16,26 @@ from services.records.recovery_report import RecoveryReport
 SPEED = [check.__name__ for check in CHECKS].index("speed")
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
 HEALTHY = StatusSnapshot(
-    state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, people_left=100,
-    battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock="not_set",
-    newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100, unsent=(4, 0), throttled_bits=0xE0000,
+    state="aim",
+    problem=None,
+    lamp_is_dark=True,
+    calibration=None,
+    store=None,
+    captures_left=400,
+    people_left=100,
+    battery=0.8,
+    emptiest=0.05,
+    head_c=31.0,
+    warmest_c=55.0,
+    computer_c=62.0,
+    now=NOON,
+    clock="not_set",
+    newest=datetime(2026, 11, 20, tzinfo=UTC),
+    presses=[(1.5, -3.5)] * 100,
+    unsent=(4, 0),
+    throttled_bits=0xE0000,
     unsaved_since=datetime(2026, 11, 14, 12, tzinfo=UTC),
-)  # fmt: skip
+)
 FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("camera", {"problem": CameraMissing("the camera is gone")}),
     ("camera", {"state": "starting"}),

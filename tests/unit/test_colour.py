@@ -19,8 +19,10 @@ def correlation(one: Image, other: Image) -> float:
 
 def test_channels_are_moved_to_the_grid_of_green_and_their_shifts_reported() -> None:
     pictures: dict[Colour, Image] = {
-        "red": seen(RED, (3.4, -5.2)), "green": seen(RETINA, (0, 0)), "blue": seen(RETINA, (-60, 2)),
-    }  # fmt: skip
+        "red": seen(RED, (3.4, -5.2)),
+        "green": seen(RETINA, (0, 0)),
+        "blue": seen(RETINA, (-60, 2)),
+    }
     joined = join_colours(pictures, LIT, 2)
     shifts = {one.name: one.shift_px for one in joined.channels}
     assert shifts["green"] == (0, 0)
@@ -53,8 +55,10 @@ def test_a_missing_blue_is_predicted_and_marked_and_amber_stands_for_red() -> No
     green, amber = seen(RETINA, (0, 0)), seen(RED, (2, 2))
     joined = join_colours({"amber": amber, "green": green}, LIT, 2)
     assert [(one.name, one.predicted, one.shift_px is None) for one in joined.channels] == [
-        ("amber", False, False), ("green", False, False), ("blue", True, True),
-    ]  # fmt: skip
+        ("amber", False, False),
+        ("green", False, False),
+        ("blue", True, True),
+    ]
     assert correlation(joined.picture[..., 0], seen(RED, (0, 0))) > 0.98
     blue = joined.picture[..., 2]
     assert blue[LIT == 0].max() == 0

@@ -42,12 +42,17 @@ def table_of(*connections: FakeConnection, local: int = 3, remote: int = 3, per_
 @pytest.mark.parametrize(
     ("one", "other", "is_same", "is_local"),
     [
-        ("127.0.0.1", "127.0.0.1", True, True), ("::1", "::1", True, True), ("127.0.0.1", "127.0.0.2", False, True),
-        ("::ffff:127.0.0.1", "127.0.0.1", True, True), ("::ffff:10.42.0.7", "10.42.0.7", True, False),
-        ("fd00::1", "fd00::ffff:2", True, False), ("fd00::1", "fd00:0:0:1::1", False, False),
-        ("10.42.0.7", "10.42.0.8", False, False), ("testclient", "testclient", True, False),
+        ("127.0.0.1", "127.0.0.1", True, True),
+        ("::1", "::1", True, True),
+        ("127.0.0.1", "127.0.0.2", False, True),
+        ("::ffff:127.0.0.1", "127.0.0.1", True, True),
+        ("::ffff:10.42.0.7", "10.42.0.7", True, False),
+        ("fd00::1", "fd00::ffff:2", True, False),
+        ("fd00::1", "fd00:0:0:1::1", False, False),
+        ("10.42.0.7", "10.42.0.8", False, False),
+        ("testclient", "testclient", True, False),
     ],
-)  # fmt: skip
+)
 def test_a_client_is_an_ipv4_address_or_an_ipv6_network_of_64_bits(
     one: str, other: str, is_same: bool, is_local: bool
 ) -> None:

@@ -28,17 +28,30 @@ from services.records.visit_repository import VisitRepository
 
 FILES = dict.fromkeys(sorted(REQUIRED_FILES), b"content")
 REPORT = {
-    "method": "variation", "seconds": {"expose": 0.25, "solve": 0.125}, "budget_s": 10.5, "warnings": ["dim"],
-    "refraction_dpt": {"sphere": -1.25, "sd": 0.5}, "verdict": {"word": "good", "code": None, "numbers": {"a": 123456}},
-    "laterality": {"eye": "OS", "score": 0.5}, "dose_j_per_cm2": 0.0625, "note": "\u00e9",
-}  # fmt: skip
+    "method": "variation",
+    "seconds": {"expose": 0.25, "solve": 0.125},
+    "budget_s": 10.5,
+    "warnings": ["dim"],
+    "refraction_dpt": {"sphere": -1.25, "sd": 0.5},
+    "verdict": {"word": "good", "code": None, "numbers": {"a": 123456}},
+    "laterality": {"eye": "OS", "score": 0.5},
+    "dose_j_per_cm2": 0.0625,
+    "note": "\u00e9",
+}
 TABLES = {
-    "captures": ("id", "eye", "taken_at", "calibration_id", "report"), "files": ("capture_id", "name", "sha256"),
-    "visits": ("id", "person", "day", "begun_at", "finished_at", "outcome"), "fields": ("visit", "name", "value"),
-    "identifiers": ("person", "name", "value"), "shots": ("capture", "visit", "slot"),
-    "slots": ("visit", "slot", "capture"), "sendings": ("visit", "finished_at", "failing_since", "error", "said"),
-    "persons": ("number",), "light_time": ("boot",), "light_doses": ("eye",), "keys": ("key", "answer", "done_at"),
-}  # fmt: skip
+    "captures": ("id", "eye", "taken_at", "calibration_id", "report"),
+    "files": ("capture_id", "name", "sha256"),
+    "visits": ("id", "person", "day", "begun_at", "finished_at", "outcome"),
+    "fields": ("visit", "name", "value"),
+    "identifiers": ("person", "name", "value"),
+    "shots": ("capture", "visit", "slot"),
+    "slots": ("visit", "slot", "capture"),
+    "sendings": ("visit", "finished_at", "failing_since", "error", "said"),
+    "persons": ("number",),
+    "light_time": ("boot",),
+    "light_doses": ("eye",),
+    "keys": ("key", "answer", "done_at"),
+}
 TURNS = 4
 DISTINCT = 8  # length from which a text occurs in rows and indices only, not in the schema
 COLUMNS = [(table, column) for table, columns in TABLES.items() for column in columns]

@@ -123,9 +123,15 @@ def test_an_export_without_a_picture_names_its_device(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("synchronized", "since_epoch", "expected"),
-    [(True, None, "network"), (True, "0", "network"), (False, "1795000000", "rtc"), (False, "63", "not_set"),
-     (False, "", "not_set"), (False, None, "not_set")],
-)  # fmt: skip
+    [
+        (True, None, "network"),
+        (True, "0", "network"),
+        (False, "1795000000", "rtc"),
+        (False, "63", "not_set"),
+        (False, "", "not_set"),
+        (False, None, "not_set"),
+    ],
+)
 def test_the_source_of_the_date_is_network_or_a_clock_that_kept_it(
     tmp_path: Path, synchronized: bool, since_epoch: str | None, expected: str
 ) -> None:

@@ -254,9 +254,13 @@ def test_a_tilted_retina_is_myopic_on_its_deeper_side(keys: dict[str, object], e
 )
 def test_accommodation_adds_its_response_to_the_mean_sphere(m_dpt, target_dpt, slope, lead_dpt, seen_dpt) -> None:
     eye = {
-        "m_dpt": m_dpt, "j0_dpt": 0.5, "fixation_dpt": target_dpt, "accommodation_slope": slope,
-        "accommodation_lead_dpt": lead_dpt, "accommodation_amplitude_dpt": 5.0,
-    }  # fmt: skip
+        "m_dpt": m_dpt,
+        "j0_dpt": 0.5,
+        "fixation_dpt": target_dpt,
+        "accommodation_slope": slope,
+        "accommodation_lead_dpt": lead_dpt,
+        "accommodation_amplitude_dpt": 5.0,
+    }
     found = alone(with_keys(PLAIN, eye=eye), "refraction", "accommodation").setup("green").refraction
     assert found == pytest.approx((seen_dpt, 0.5, 0.0))
 
@@ -370,9 +374,10 @@ def prepared_frame(of: World, flat: bool) -> np.ndarray:
 def test_flat_frame_corrects_prnu() -> None:
     spec = with_keys(PLAIN, sensor={"prnu": 0.02})
     true, uncorrected, corrected = (
-        prepared_frame(alone(spec), False), prepared_frame(alone(spec, "prnu"), False),
+        prepared_frame(alone(spec), False),
+        prepared_frame(alone(spec, "prnu"), False),
         prepared_frame(alone(spec, "prnu"), True),
-    )  # fmt: skip
+    )
     bright = true > 0.3 * true.max()
     assert (uncorrected[bright] / true[bright]).std() == pytest.approx(0.02, rel=0.05)
     assert (corrected[bright] / true[bright]).std() < 1e-3
@@ -448,9 +453,14 @@ def test_bandwidth_traces_three_wavelengths() -> None:
     assert alone(PLAIN, "bandwidth").setup("green").lines == 3
 
 
-@pytest.mark.parametrize("light", [
-    {"led_spread": 0.5}, {"led_spread": 0.5, "dead_led": 3}, {"ring_offset_um": 1000.0, "dead_led": 3},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "light",
+    [
+        {"led_spread": 0.5},
+        {"led_spread": 0.5, "dead_led": 3},
+        {"ring_offset_um": 1000.0, "dead_led": 3},
+    ],
+)
 def test_leds_change_only_the_gain_while_the_pupil_cuts_no_ray(light: dict[str, float]) -> None:
     spec = with_keys(PLAIN, light=light)
     assert effect_named("leds").size(scene(spec)).eta == 0
@@ -478,8 +488,9 @@ def ray_at_the_pupil(led_mm: float, slope: float, offset_mm: float) -> tuple[flo
 @pytest.mark.parametrize("offset_mm", [-12.0, 2.0, 5.0])
 @pytest.mark.parametrize("decentred_mm", [0.0, 0.3])
 def test_lit_share_equals_ray_tracing_through_the_pupil(offset_mm, decentred_mm) -> None:
-    spec = with_keys(PLAIN, light={"ring_offset_um": 1000 * offset_mm, "dead_led": 5},
-                  eye={"decentred_um": 1000 * decentred_mm})  # fmt: skip
+    spec = with_keys(
+        PLAIN, light={"ring_offset_um": 1000 * offset_mm, "dead_led": 5}, eye={"decentred_um": 1000 * decentred_mm}
+    )
     here, soft_mm = scene(spec), 0.75 * EMITTER_MM / 2
     leds = [(4.75 * np.cos(pi * k / 6), 4.75 * np.sin(pi * k / 6)) for k in range(12) if k != 5]
     compared = 0

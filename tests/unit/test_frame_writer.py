@@ -58,8 +58,11 @@ def test_frames_are_read_as_they_were_taken_with_dose_light_and_number(tmp_path:
         frame, metadata = one.load()
         assert np.array_equal(frame.counts, before.counts)
         assert (frame.exposure_s, frame.number, frame.illumination, frame.simulated) == (
-            before.exposure_s, before.number, before.illumination, True,
-        )  # fmt: skip
+            before.exposure_s,
+            before.number,
+            before.illumination,
+            True,
+        )
         assert (metadata.id, metadata.eye, metadata.taken_at) == (SHARED.id, "OD", NOON)
         assert (metadata.calibration_id, metadata.head) == ("00ff", "head")
     writer.close()

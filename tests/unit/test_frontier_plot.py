@@ -36,8 +36,12 @@ from services.lab.frontier_thumbnails import (
 from tests.drawings import SVG, TextBox, boxes, overlapping
 
 SCORES = {"ssim": 0.7, "highpass_pcc": 0.8, "vessel_contrast": 0.1}
-KINDS = [(name, n, rounds) for name, method in METHODS.items() for n in (1, 2, 3, 4)
-         for rounds in ((0, 1, 2, 4, 8, 12, 20) if method.round_pairs else (0,))]  # fmt: skip
+KINDS = [
+    (name, n, rounds)
+    for name, method in METHODS.items()
+    for n in (1, 2, 3, 4)
+    for rounds in ((0, 1, 2, 4, 8, 12, 20) if method.round_pairs else (0,))
+]
 LARGEST_BYTES = 250_000  # of a committed picture
 
 
@@ -47,16 +51,30 @@ def measured(rng: np.random.Generator, field_known: bool = True, refract_s: floa
         Point(*kind, 10 ** rng.uniform(-2.3, 0), 1.0, pcc=0.9, psnr_db=rng.uniform(24, 31), **SCORES) for kind in KINDS
     )
     best = tuple(BestMu("tikhonov", n, 1e-4, 0.01 / n, pcc=0.8, psnr_db=26.0 + n / 9, **SCORES) for n in (1, 2, 3, 4))
-    choice = Choice("variation", 2, 12, "budget", 0.1 + refract_s, 0.2, True, refract_s, 0.1, 0.0, pcc=0.9,
-                    psnr_db=30.9, **SCORES)  # fmt: skip
-    light = tuple(LightPoint(n, n, n * 1e-5, 0.5 * n, pcc=0.9, psnr_db=31 + n / 8, **SCORES, bound_psnr_db=30.0)
-                  for n in (1, 2, 4, 8))  # fmt: skip
+    choice = Choice(
+        "variation", 2, 12, "budget", 0.1 + refract_s, 0.2, True, refract_s, 0.1, 0.0, pcc=0.9, psnr_db=30.9, **SCORES
+    )
+    light = tuple(
+        LightPoint(n, n, n * 1e-5, 0.5 * n, pcc=0.9, psnr_db=31 + n / 8, **SCORES, bound_psnr_db=30.0)
+        for n in (1, 2, 4, 8)
+    )
     return Frontier(
-        Machine("Some processor", 2, "Linux", 1), {}, "Human eye scene, IMX296 with high-power ring", True,
-        FrameSize(1080, 1920), ScoredRegion("the field", field_known, 9, "", "", 0.02, "", 60.0, (0, 0), 0.2), "", "",
-        points, best, 0.26, choice, (), light,
+        Machine("Some processor", 2, "Linux", 1),
+        {},
+        "Human eye scene, IMX296 with high-power ring",
+        True,
+        FrameSize(1080, 1920),
+        ScoredRegion("the field", field_known, 9, "", "", 0.02, "", 60.0, (0, 0), 0.2),
+        "",
+        "",
+        points,
+        best,
+        0.26,
+        choice,
+        (),
+        light,
         tuple(PeerPoint(f"LenslessPiCam 1, {n} rounds", n / 1.0, 0.8, 28.0, 0.6) for n in (10, 40, 100)),
-    )  # fmt: skip
+    )
 
 
 def panel_boxes(drawing: str) -> list[list[TextBox]]:

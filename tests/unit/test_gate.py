@@ -37,16 +37,22 @@ def differences(drawn: Netlist) -> list[Pin]:
     names = {pin: re.sub(r"~\{(\w+)\}", r"/\1", name) for pin, name in drawn.names.items()}
     ours = {pin: (names[pin] if len(drawn.pins(pin[0])) > 2 else "", net) for pin, net in drawn.nets.items()}
     header = {pin for pin in ours if pin[0] == "J1"}
-    return [pin for pin in ours.keys() | documented().keys()
-            if pin not in header and ours.get(pin) != documented().get(pin)] + wrong_header(drawn)  # fmt: skip
+    return [
+        pin for pin in ours.keys() | documented().keys() if pin not in header and ours.get(pin) != documented().get(pin)
+    ] + wrong_header(drawn)
 
 
 def wrong_header(drawn: Netlist) -> list[Pin]:
     """Return the pins of the computer's header whose line or net is not that of the code and the head file."""
     gpio = load_head(HEADS / "imx296_power.toml").gpio
     assert gpio is not None
-    nets = {"3.3 V": "+3V3", "5 V": "+5V", "ground": "GND", f"GPIO{gpio.heartbeat}": "HEARTBEAT",
-            f"GPIO{gpio.button}": "BUTTON"} | {line: signal for signal, (line, _) in BUSES.items()}  # fmt: skip
+    nets = {
+        "3.3 V": "+3V3",
+        "5 V": "+5V",
+        "ground": "GND",
+        f"GPIO{gpio.heartbeat}": "HEARTBEAT",
+        f"GPIO{gpio.button}": "BUTTON",
+    } | {line: signal for signal, (line, _) in BUSES.items()}
     return [pin for pin in drawn.pins("J1") if drawn.nets[pin] != nets[HEADER[int(pin[1])]]]
 
 
@@ -129,10 +135,16 @@ def ohms(drawn: Netlist, one: str, other: str) -> list[str]:
 def reached(drawn: Netlist, net: str) -> set[str | None]:
     """Return the nets to which resistors lead from a net."""
     nets = {net}
-    while more := {
-        other for ref in drawn.values if ref[0] == "R"
-        for here, other in itertools.permutations((drawn.nets[ref, "1"], drawn.nets[ref, "2"])) if here in nets
-    } - nets:  # fmt: skip
+    while (
+        more := {
+            other
+            for ref in drawn.values
+            if ref[0] == "R"
+            for here, other in itertools.permutations((drawn.nets[ref, "1"], drawn.nets[ref, "2"]))
+            if here in nets
+        }
+        - nets
+    ):
         nets |= more
     return nets
 

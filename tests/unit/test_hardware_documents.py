@@ -30,10 +30,27 @@ PAPERS = ("hardware/wiring.md", "hardware/assembly.md", "hardware/model-eye.md")
 RING = "hardware/decisions/0005-ring-of-10-mm.md"
 HEADS = sorted((HARDWARE / "heads").glob("*.toml"))
 HEADER: dict[int, str] = {  # pins of the 40-pin header of a Raspberry Pi
-    1: "3.3 V", 2: "5 V", 3: "GPIO2", 4: "5 V", 5: "GPIO3", 6: "ground", 7: "GPIO4", 8: "GPIO14", 9: "ground",
-    10: "GPIO15", 11: "GPIO17", 12: "GPIO18", 13: "GPIO27", 15: "GPIO22", 16: "GPIO23", 19: "GPIO10", 21: "GPIO9",
-    23: "GPIO11", 24: "GPIO8", 25: "ground",
-}  # fmt: skip
+    1: "3.3 V",
+    2: "5 V",
+    3: "GPIO2",
+    4: "5 V",
+    5: "GPIO3",
+    6: "ground",
+    7: "GPIO4",
+    8: "GPIO14",
+    9: "ground",
+    10: "GPIO15",
+    11: "GPIO17",
+    12: "GPIO18",
+    13: "GPIO27",
+    15: "GPIO22",
+    16: "GPIO23",
+    19: "GPIO10",
+    21: "GPIO9",
+    23: "GPIO11",
+    24: "GPIO8",
+    25: "ground",
+}
 BUSES = {
     "MOSI": ("GPIO10", "spidev0"),
     "SCLK": ("GPIO11", "spidev0"),
@@ -144,8 +161,11 @@ def test_wiring_matches_the_head_file(head: Path) -> None:
     if spec.bus is not None:
         assert wired_values("bus.device") == {spec.bus.device}
         sda = wires()[3][2]
-        for part, address in (("thermometer", spec.bus.thermometer), ("fuel gauge", spec.bus.battery),
-                              ("head memory", spec.bus.memory)):  # fmt: skip
+        for part, address in (
+            ("thermometer", spec.bus.thermometer),
+            ("fuel gauge", spec.bus.battery),
+            ("head memory", spec.bus.memory),
+        ):
             assert address is None or f"**{part}** 0x{address:02x}" in sda
     if spec.gpio is not None:
         assert wired_values("gpio.heartbeat") == {str(spec.gpio.heartbeat)}
@@ -209,19 +229,28 @@ def test_figures_of_the_assembly_match_the_optics() -> None:
     wide = optical_budget(replace(design, optics=path.optics.model_copy(update={"field_deg": 50.0})))
     beside = ChainSpec(axis=(3, 3), leds=(18, 19, 20, 26, 28, 34, 35, 36))
     figures = [
-        f"{relay.first_mm:g} mm before the first", f"second lens are {relay.first_mm + relay.second_mm:g} mm apart",
-        f"{relay.second_mm:g} mm behind the second lens", f"10 mm measure {10 * relay.pupil_magnification:.1f} mm",
-        f"the iris is {budget.iris_at_eye_mm:.2f} mm wide", f"has {budget.pupil_margin_mm:.2f} mm of margin",
-        f"one of 3 mm has {small.pupil_margin_mm:.2f} mm", f"0.1 mm are {10 / relay.diffuser_to_sensor_mm:.1f} %",
-        f"{path.relay.splitter_to_iris_mm:g} mm before the iris", f"beam is {budget.splitter_mm:.1f} mm wide there",
-        f"plate shows {path.relay.splitter_mm / 2**0.5:.1f} mm", f"ring of {budget.ring_at_pupil_mm:.2f} mm",
-        f"full cone of {budget.led_cone_deg:.2f} degrees", f"{budget.light.cornea_mw:.3f} mW of green",
+        f"{relay.first_mm:g} mm before the first",
+        f"second lens are {relay.first_mm + relay.second_mm:g} mm apart",
+        f"{relay.second_mm:g} mm behind the second lens",
+        f"10 mm measure {10 * relay.pupil_magnification:.1f} mm",
+        f"the iris is {budget.iris_at_eye_mm:.2f} mm wide",
+        f"has {budget.pupil_margin_mm:.2f} mm of margin",
+        f"one of 3 mm has {small.pupil_margin_mm:.2f} mm",
+        f"0.1 mm are {10 / relay.diffuser_to_sensor_mm:.1f} %",
+        f"{path.relay.splitter_to_iris_mm:g} mm before the iris",
+        f"beam is {budget.splitter_mm:.1f} mm wide there",
+        f"plate shows {path.relay.splitter_mm / 2**0.5:.1f} mm",
+        f"ring of {budget.ring_at_pupil_mm:.2f} mm",
+        f"full cone of {budget.led_cone_deg:.2f} degrees",
+        f"{budget.light.cornea_mw:.3f} mW of green",
         f"about {200 * tan(radians(budget.field_deg / 2)) + budget.ring_at_pupil_mm:.1f} mm",
-        f"LEDs {', '.join(map(str, ring(path.ring)))}", f"reflex ({2 * budget.reflex_free_mm:.2f} mm)",
-        f"36: {ring_at_pupil_mm(beside, 0.75):.2f} mm", f"and {inner_ring_at_pupil_mm(beside, 0.75):.2f} mm at its",
+        f"LEDs {', '.join(map(str, ring(path.ring)))}",
+        f"reflex ({2 * budget.reflex_free_mm:.2f} mm)",
+        f"36: {ring_at_pupil_mm(beside, 0.75):.2f} mm",
+        f"and {inner_ring_at_pupil_mm(beside, 0.75):.2f} mm at its",
         f"the inner four: {ring_at_pupil_mm(ring_for_pupil(path.ring, 7, 0.75), 0.75):.2f} mm at the pupil",
         f"its beam is {wide.splitter_mm:.1f} mm wide",
-    ]  # fmt: skip
+    ]
     guide = " ".join(f"{text('hardware/assembly.md')} {text(RING)}".split())
     assert [figure for figure in figures if figure not in guide] == []
 
@@ -232,8 +261,10 @@ def test_faces_of_the_lens_rims_in_the_guide_are_those_of_the_lens_data() -> Non
 
     def rim_mm(name: str) -> float:
         lens = path.lens[name]
-        first, last = (abs(radius) - sqrt(radius**2 - (lens.diameter_mm / 2) ** 2)
-                       for radius in (lens.radii_mm[0], lens.radii_mm[-1]))  # fmt: skip
+        first, last = (
+            abs(radius) - sqrt(radius**2 - (lens.diameter_mm / 2) ** 2)
+            for radius in (lens.radii_mm[0], lens.radii_mm[-1])
+        )
         return sum(lens.thick_mm) - first - last
 
     wide, long = rim_mm("AC508-075-A"), rim_mm("AC508-100-A")
@@ -285,8 +316,10 @@ def test_other_pinholes_of_the_guide_match_the_optics() -> None:
     guide = " ".join(text("hardware/assembly.md").split())
     mm_per_deg = relay.diffuser_to_sensor_mm * tan(radians(relay.angular_magnification))
     widths_deg = {um: degrees(um / 25_000) for um in (200, 250, 275, 300)}
-    nulls = [1.22 / (path.optics.diffuser_to_sensor_um / 1000 * relay.angular_magnification * radians(deg)) * mm_per_deg
-             for deg in widths_deg.values()]  # fmt: skip
+    nulls = [
+        1.22 / (path.optics.diffuser_to_sensor_um / 1000 * relay.angular_magnification * radians(deg)) * mm_per_deg
+        for deg in widths_deg.values()
+    ]
     first, *others = [f"{deg:.2f} for {um}" for um, deg in widths_deg.items()]
     assert f"in degrees: {first} um, {', '.join(others)}." in guide
     assert f"{(275 / 200) ** 2:.1f} times for 200 um" in guide
@@ -342,10 +375,12 @@ def test_distances_of_glass_in_the_guide_are_those_of_the_ray_trace() -> None:
         f"rims {rims_mm(*faces[2:4]):.1f} mm (75) and {rims_mm(*faces[8:10]):.1f} mm (100)",
         f"{rims_mm(*faces[5:7]):.1f} mm from rim to rim",
         f"are {faces[half].at_mm - faces[half - 1].at_mm:.1f} mm, measured on the axis",
-        f"last glass {last_mm:.1f} mm before the iris", f"pupil {faces[0].at_mm:.1f} mm before the first glass",
-        f"is {float(stop[1]) - last_mm:.1f} mm more", f"by {along:.2f} mm towards the glass for each",
+        f"last glass {last_mm:.1f} mm before the iris",
+        f"pupil {faces[0].at_mm:.1f} mm before the first glass",
+        f"is {float(stop[1]) - last_mm:.1f} mm more",
+        f"by {along:.2f} mm towards the glass for each",
         f"It is {faces[0].at_mm - (float(stop[1]) - last_mm) * along:.1f} mm, within",
-    ]  # fmt: skip
+    ]
     assert [figure for figure in figures if figure not in guide] == []
 
 

@@ -116,12 +116,22 @@ def test_a_measured_colour_has_its_guard_factor_and_others_the_worst_case() -> N
 
 @pytest.mark.parametrize(
     ("original", "replacement"),
-    [("limit = 220.0", ""), ("limit = 220.0", "limit = -1"), ("uW/cm2", "mW/cm2"), ("\nchecked = false", ""),
-     ("share = 0.10", "share = 10"), ("[thermal_irradiance]", "[thermal"), ("1.43, ", ""),
-     ("window_h = 24.0", "window_h = 2"), ("share_without_visit = 0.05", "share_without_visit = 0.10"),
-     ("[waist_irradiance]", "[waste_irradiance]"), ("share = 0.5 ", "share = 0.6 "),
-     ("\nchecked = false", "\nchecked = true"), ("\nchecked = false", '\nchecked = false\nchecked_by = "A. Lovelace"')],
-)  # fmt: skip
+    [
+        ("limit = 220.0", ""),
+        ("limit = 220.0", "limit = -1"),
+        ("uW/cm2", "mW/cm2"),
+        ("\nchecked = false", ""),
+        ("share = 0.10", "share = 10"),
+        ("[thermal_irradiance]", "[thermal"),
+        ("1.43, ", ""),
+        ("window_h = 24.0", "window_h = 2"),
+        ("share_without_visit = 0.05", "share_without_visit = 0.10"),
+        ("[waist_irradiance]", "[waste_irradiance]"),
+        ("share = 0.5 ", "share = 0.6 "),
+        ("\nchecked = false", "\nchecked = true"),
+        ("\nchecked = false", '\nchecked = false\nchecked_by = "A. Lovelace"'),
+    ],
+)
 def test_a_damaged_limits_file_raises_spec_error(tmp_path: Path, original: str, replacement: str) -> None:
     text = LIMITS.read_text(encoding="utf-8")
     assert original in text

@@ -80,9 +80,18 @@ def test_a_good_head_passes_with_any_eye(retina: int, m_dpt: float, record_prope
 
 
 RETINA_SCENES = (
-    "calm", "colour_sensor", "crowded_imx296", "diabetic", "dim", "drifting_eye", "paper_heine", "short_sighted",
-    "small_pupil", "stray_light", "worn_sensor",
-)  # fmt: skip
+    "calm",
+    "colour_sensor",
+    "crowded_imx296",
+    "diabetic",
+    "dim",
+    "drifting_eye",
+    "paper_heine",
+    "short_sighted",
+    "small_pupil",
+    "stray_light",
+    "worn_sensor",
+)
 
 
 @pytest.mark.parametrize("name", RETINA_SCENES)
@@ -354,5 +363,8 @@ def test_a_frame_without_an_eye_is_not_compared_with_the_psf() -> None:
     cut = ExposurePair(NOW, frame_through(caustic_of_eye(diffuser=5)), dark(), 0.1, shows_eye=False)
     assert assess_capture(calibrated(), KNOWN, witness(), cut).statement is None
     assert found(assess_capture(calibrated(), KNOWN, witness(), cut)).keys() == {
-        "age", "hot pixels", "black level", "dark noise",
-    }  # fmt: skip
+        "age",
+        "hot pixels",
+        "black level",
+        "dark noise",
+    }

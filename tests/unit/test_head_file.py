@@ -59,9 +59,12 @@ def test_simulated_head_has_the_papers_sensor(tmp_path: Path) -> None:
 
 
 TYPOS = {
-    "rows": ("rowz", "camera.rowz"), "exposure_s": ("exposure_ms", "camera.exposure_ms"),
-    "colour": ("color", "light.color"), "iris_um": ("iris_mm", "optics.iris_mm"), "seed": ("sead", "sim.sead"),
-}  # fmt: skip
+    "rows": ("rowz", "camera.rowz"),
+    "exposure_s": ("exposure_ms", "camera.exposure_ms"),
+    "colour": ("color", "light.color"),
+    "iris_um": ("iris_mm", "optics.iris_mm"),
+    "seed": ("sead", "sim.sead"),
+}
 
 
 @pytest.mark.parametrize("right", TYPOS)

@@ -90,9 +90,15 @@ def drawn(rng: np.random.Generator) -> DrawnHeads:
     first, second = within(37.5, 0.375), within(50.0, 0.5)
     brightness = 30 * np.exp(rng.uniform(np.log(0.7), np.log(8.0), (COUNT, 1))) * within(1, 0.1, 4)
     return DrawnHeads(
-        within(cap.hole_mm, 0.1), within(cap.height_mm, 0.3), within(cap.emitter_mm, 0.1), within(0, 0.2, 4, 2),
-        first / second, brightness, within(TRANSMISSION_TO_EYE, 0.15 * TRANSMISSION_TO_EYE), within(525, 7.5),
-    )  # fmt: skip
+        within(cap.hole_mm, 0.1),
+        within(cap.height_mm, 0.3),
+        within(cap.emitter_mm, 0.1),
+        within(0, 0.2, 4, 2),
+        first / second,
+        brightness,
+        within(TRANSMISSION_TO_EYE, 0.15 * TRANSMISSION_TO_EYE),
+        within(525, 7.5),
+    )
 
 
 def without_reserve() -> Limits:
@@ -111,10 +117,12 @@ def test_no_drawn_head_gets_go_whose_highest_irradiance_exceeds_the_limit() -> N
     weigh = limits.photochemical_weight.of_spectrum
     limit = limits.photochemical_w_per_cm2
     true = heads.highest_mw_per_cm2() / 1000 * [weigh(nm / 1000, 0.035) for nm in heads.peak_nm] / limit
-    go = np.array([
-        judge(SPEC, DESIGN, MeterReading("green", uw, 1.0, nm, "drawn"), limits).is_go
-        for uw, nm in zip(shown_uw, shown_nm, strict=True)
-    ])  # fmt: skip
+    go = np.array(
+        [
+            judge(SPEC, DESIGN, MeterReading("green", uw, 1.0, nm, "drawn"), limits).is_go
+            for uw, nm in zip(shown_uw, shown_nm, strict=True)
+        ]
+    )
     right = true <= 1
     assert 300 < right.sum() < 700, "the draw has heads on both sides of the limit"
     assert true[go].max() <= 1
@@ -135,8 +143,14 @@ def test_the_guard_of_an_unmeasured_ring_counts_more_than_any_drawn_head() -> No
 def test_the_highest_irradiance_is_that_of_the_axis_and_needs_no_field(seed: int) -> None:
     """E = I / f^2 of the drawn head agrees with the design whatever its hole, height and die are."""
     heads = drawn(np.random.default_rng(seed))
-    of_axis = (heads.led_mw.sum(axis=1) / 120 * heads.transmission / TRANSMISSION_TO_EYE
-               * (heads.magnification / 0.75) ** 2 * DESIGN.highest_mw_per_cm2)  # fmt: skip
+    of_axis = (
+        heads.led_mw.sum(axis=1)
+        / 120
+        * heads.transmission
+        / TRANSMISSION_TO_EYE
+        * (heads.magnification / 0.75) ** 2
+        * DESIGN.highest_mw_per_cm2
+    )
     times = heads.highest_mw_per_cm2() / of_axis
     assert times.max() < 1.001
     assert times.min() > 0.97, "an LED at its hole's rim shows a part of its die on the axis"

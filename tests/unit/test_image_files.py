@@ -200,10 +200,16 @@ def test_psfs_of_another_camera_mode_are_refused() -> None:
 @pytest.mark.parametrize(
     ("shape", "frames", "each"),
     [
-        ((6, 8), 1, (6, 8)), ((6, 8, 1), 1, (6, 8)), ((1, 6, 8), 1, (6, 8)), ((1, 6, 8, 1), 1, (6, 8)),
-        ((1, 6, 8, 3), 1, (6, 8, 3)), ((6, 8, 3), 1, (6, 8, 3)), ((3, 6, 8), 3, (6, 8)), ((5, 6, 8, 3), 5, (6, 8, 3)),
+        ((6, 8), 1, (6, 8)),
+        ((6, 8, 1), 1, (6, 8)),
+        ((1, 6, 8), 1, (6, 8)),
+        ((1, 6, 8, 1), 1, (6, 8)),
+        ((1, 6, 8, 3), 1, (6, 8, 3)),
+        ((6, 8, 3), 1, (6, 8, 3)),
+        ((3, 6, 8), 3, (6, 8)),
+        ((5, 6, 8, 3), 5, (6, 8, 3)),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("suffix", ["npy", "tiff", "npz"])
 def test_layouts_of_frames_and_stacks_are_read(
     tmp_path: Path, shape: tuple[int, ...], frames: int, each: tuple[int, ...], suffix: str
@@ -251,8 +257,10 @@ def test_transparent_png_is_refused(tmp_path: Path) -> None:
 
 
 DNG_TAGS = [
-    (33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\1\0\2\1", True), (50714, "2I", 1, (640, 10), True),
-]  # fmt: skip
+    (33421, "H", 2, (2, 2), True),
+    (33422, "B", 4, b"\1\0\2\1", True),
+    (50714, "2I", 1, (640, 10), True),
+]
 
 
 def test_plain_dng_is_read_with_pattern_and_black_level(tmp_path: Path) -> None:
@@ -274,10 +282,13 @@ def test_pattern_of_a_dng_follows_its_areas_and_its_orientation(
     for top, left, row, col in ((0, 0, 0, 0), (1, 2, 0, 1), (3, 0, 1, 1), (2, 1, 3, 2)):
         pattern = bytes(filters[top : top + 2, left : left + 2].ravel().astype(np.uint8))
         tags = [
-            (33421, "H", 2, (2, 2), True), (33422, "B", 4, pattern, True), (274, "H", 1, orientation, True),
+            (33421, "H", 2, (2, 2), True),
+            (33422, "B", 4, pattern, True),
+            (274, "H", 1, orientation, True),
             (50829, "I", 4, (top, left, 18, 18), True),
-            (50719, "I", 2, (col, row), True), (50720, "I", 2, size[::-1], True),
-        ]  # fmt: skip
+            (50719, "I", 2, (col, row), True),
+            (50720, "I", 2, size[::-1], True),
+        ]
         tifffile.imwrite(tmp_path / "a.dng", filters, photometric="cfa", extratags=tags)
         read = read_image_file(tmp_path / "a.dng")
         (pixels,) = read.frames
@@ -369,12 +380,15 @@ def profile(curve: bytes) -> bytes:
 
 
 CURVES: dict[bytes, str | None] = {
-    b"curv" + bytes(8): None, struct.pack(">4sIIH", b"curv", 0, 1, 256): None,
-    struct.pack(">4sII3H", b"curv", 0, 3, 0, 32768, 65535): None, struct.pack(">4sIHHi", b"para", 0, 0, 0, 65536): None,
+    b"curv" + bytes(8): None,
+    struct.pack(">4sIIH", b"curv", 0, 1, 256): None,
+    struct.pack(">4sII3H", b"curv", 0, 3, 0, 32768, 65535): None,
+    struct.pack(">4sIHHi", b"para", 0, 0, 0, 65536): None,
     struct.pack(">4sIIH", b"curv", 0, 1, 563): "gamma 2.2",
     struct.pack(">4sII3H", b"curv", 0, 3, 0, 14000, 65535): "bent",
-    struct.pack(">4sIHHi", b"para", 0, 0, 0, 144180): "power 2.2", b"curv": "cut short",
-}  # fmt: skip
+    struct.pack(">4sIHHi", b"para", 0, 0, 0, 144180): "power 2.2",
+    b"curv": "cut short",
+}
 
 
 @pytest.mark.parametrize("curve", CURVES)
@@ -466,9 +480,14 @@ def test_invalid_image_file_is_refused_with_its_path(tmp_path: Path) -> None:
 
 def test_arrays_that_are_no_images_are_refused(tmp_path: Path) -> None:
     for name, array in {
-        "line": np.zeros(5), "two": np.zeros((4, 4, 2)), "none": np.zeros((0, 4)), "complex": np.zeros((4, 4), complex),
-        "bool": np.zeros((4, 4), bool), "text": np.array([["a", "b"]]), "stack": np.zeros((2, 4, 4, 3)),
-    }.items():  # fmt: skip
+        "line": np.zeros(5),
+        "two": np.zeros((4, 4, 2)),
+        "none": np.zeros((0, 4)),
+        "complex": np.zeros((4, 4), complex),
+        "bool": np.zeros((4, 4), bool),
+        "text": np.array([["a", "b"]]),
+        "stack": np.zeros((2, 4, 4, 3)),
+    }.items():
         np.save(tmp_path / f"{name}.npy", array)
         refused_file(tmp_path / f"{name}.npy", "shape|type")
     np.save(tmp_path / "object.npy", np.array([[{}]]), allow_pickle=True)

@@ -19,8 +19,10 @@ OTHER: dict[Eye | None, Eye | None] = {"OD": "OS", "OS": "OD", None: None}
 PHOTOS = Path(__file__).parents[2].parent / "shared" / "data" / "fundus" / "hrf" / "images"
 # Eye, and (row, col) of the picture's centre in the photograph, between macula and disc; 54.4 pixels per degree.
 EYES: dict[str, tuple[Eye, int, int]] = {
-    "06_dr.JPG": ("OD", 1142, 2051), "07_h.jpg": ("OD", 1177, 2168), "09_g.jpg": ("OS", 1206, 1482),
-}  # fmt: skip
+    "06_dr.JPG": ("OD", 1142, 2051),
+    "07_h.jpg": ("OD", 1177, 2168),
+    "09_g.jpg": ("OS", 1206, 1482),
+}
 
 
 @cache
@@ -45,9 +47,12 @@ def estimated(picture: Image) -> Laterality:
 
 
 @given(
-    st.integers(0, 9999), st.integers(100, 290), st.integers(100, 290), st.sampled_from([3.0, 5.5, 8.0, 16.0]),
+    st.integers(0, 9999),
+    st.integers(100, 290),
+    st.integers(100, 290),
+    st.sampled_from([3.0, 5.5, 8.0, 16.0]),
     st.booleans(),
-)  # fmt: skip
+)
 def test_a_mirrored_picture_gives_exactly_the_other_eye(
     seed: int, rows: int, cols: int, per_deg: float, has_disc: bool
 ) -> None:
@@ -105,12 +110,16 @@ def test_bright_patches_without_vessels_give_no_eye() -> None:
 @pytest.mark.parametrize(
     "picture",
     [
-        np.zeros((270, 270), np.float32), np.full((270, 270), 0.3, np.float32), np.full((270, 270), np.nan, np.float32),
-        np.random.default_rng(1).random((270, 270), np.float32), np.ones((3, 4), np.float32),
-        -np.ones((270, 270), np.float32), np.tile(np.linspace(0, 1, 270, dtype=np.float32), (270, 1)),
+        np.zeros((270, 270), np.float32),
+        np.full((270, 270), 0.3, np.float32),
+        np.full((270, 270), np.nan, np.float32),
+        np.random.default_rng(1).random((270, 270), np.float32),
+        np.ones((3, 4), np.float32),
+        -np.ones((270, 270), np.float32),
+        np.tile(np.linspace(0, 1, 270, dtype=np.float32), (270, 1)),
     ],
     ids=["black", "even", "no numbers", "noise", "tiny", "negative", "a ramp"],
-)  # fmt: skip
+)
 def test_pictures_other_than_retinas_give_no_eye(picture: Image) -> None:
     assert estimated(picture).eye is None
 

@@ -199,12 +199,15 @@ def test_documents_have_the_figures_of_the_chosen_head() -> None:
     small = replace(chosen, pupil_mm=7.0)
     bound = simulated(chain(chosen))
     facts = {
-        "electrons": f"{spaced(product(chain(chosen)))} electrons", "small pupil": f"{spaced(product(chain(small)))}",
-        "within": f"{spaced(built.electrons.median)}", "no go": f"{100 * built.no_go:.0f} % of builds are NO GO",
-        "share": f"{100 * shares[0].used:.0f} % of", "range": f"{low} to {high} %",
+        "electrons": f"{spaced(product(chain(chosen)))} electrons",
+        "small pupil": f"{spaced(product(chain(small)))}",
+        "within": f"{spaced(built.electrons.median)}",
+        "no go": f"{100 * built.no_go:.0f} % of builds are NO GO",
+        "share": f"{100 * shares[0].used:.0f} % of",
+        "range": f"{low} to {high} %",
         "half-period": f"{half_period_um(chosen, built.electrons.median):.0f} (um )?instead of "
         f"{half_period_um(design('imx296'), product(chain(design('imx296')))):.0f} um",
-    }  # fmt: skip
+    }
     decision = " ".join(text("hardware/decisions/0006-ring-of-high-power-leds.md").split())
     readme, optics = (" ".join(text(name).split()) for name in ("hardware/README.md", "device/optics/OPTICS.md"))
     for words in (readme, decision):

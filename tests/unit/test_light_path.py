@@ -21,8 +21,10 @@ def unexplained(path: LightPath, spec: InstrumentSpec, text: str) -> list[str]:
     ours = spec.optics or path.optics
     chain = spec.light.chain or path.ring
     others = [("optics", key, getattr(ours, key), getattr(path.optics, key)) for key in OpticsSpec.model_fields]
-    others += [("light.chain", key, getattr(chain, key), getattr(path.ring, key))
-               for key in ("rows", "cols", "pitch_mm", "ring_mm", "leds")]  # fmt: skip
+    others += [
+        ("light.chain", key, getattr(chain, key), getattr(path.ring, key))
+        for key in ("rows", "cols", "pitch_mm", "ring_mm", "leds")
+    ]
     lines = text.splitlines()
     found = []
     for table, key, here, there in others:

@@ -21,5 +21,8 @@ def test_records_beyond_the_rate_are_counted_in_the_next_interval(caplog: pytest
     logger.warning("one more")
     logger.removeFilter(limit)
     assert caplog.messages == [
-        "accept failed 0", "accept failed 1", "another failure (and 4 suppressed messages before it)", "one more",
-    ]  # fmt: skip
+        "accept failed 0",
+        "accept failed 1",
+        "another failure (and 4 suppressed messages before it)",
+        "one more",
+    ]

@@ -59,9 +59,12 @@ def test_number_that_is_not_reproduced_is_not_counted_as_held() -> None:
 
 def test_every_row_has_a_label_and_the_reason_of_its_limit_or_a_star() -> None:
     rows = (
-        above("a", 0.9, 0.88, "printed"), above("b", 0.9, 0.88), above("c", 0.9, 0.88, "printed").put_in("given"),
-        above("d", 0.9, 0.88).limit_from("half a pixel"), attempted("e", 0.1, 0.4, 0.6, ".5").because("no figure"),
-    )  # fmt: skip
+        above("a", 0.9, 0.88, "printed"),
+        above("b", 0.9, 0.88),
+        above("c", 0.9, 0.88, "printed").put_in("given"),
+        above("d", 0.9, 0.88).limit_from("half a pixel"),
+        attempted("e", 0.1, 0.4, 0.6, ".5").because("no figure"),
+    )
     assert [claim.label for claim in rows] == ["as written", "ours", "put in", "ours", "not reproduced"]
     page = html(ran(*rows), 1)
     assert "Labels of the 5 rows: 1 as written, 1 put in, 1 not reproduced, 2 ours." in page

@@ -230,9 +230,15 @@ def test_the_metadata_of_a_release_are_read_whole_and_written_to_the_same_bytes(
 def test_metadata_of_another_type_are_unknown(glow: object) -> None:
     """A raw frame whose metadata are incomplete can still be reconstructed."""
     wrong = {
-        "id": 7, "eye": "left", "taken_at": "yesterday", "exposure_s": "0.1", "glow": glow, "simulated": "true",
-        "calibration_id": [], "head": {},
-    }  # fmt: skip
+        "id": 7,
+        "eye": "left",
+        "taken_at": "yesterday",
+        "exposure_s": "0.1",
+        "glow": glow,
+        "simulated": "true",
+        "calibration_id": [],
+        "head": {},
+    }
     assert set(wrong) == set(metadata_entries(RawMetadata()))
     assert read_metadata(wrong) == read_metadata({}) == RawMetadata()
 

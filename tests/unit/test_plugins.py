@@ -56,8 +56,9 @@ def own_effect(tmp_path: Path) -> Iterator[None]:
 
 def solved(method: Method) -> np.ndarray:
     table = {method.name: method}
-    make = Reconstructor(CALIBRATION, SHAPE, scenes.PLANNER, scenes.VirtualClock(), (Recipe(method.name, 1),),
-                         timed=False, methods=table)  # fmt: skip
+    make = Reconstructor(
+        CALIBRATION, SHAPE, scenes.PLANNER, scenes.VirtualClock(), (Recipe(method.name, 1),), timed=False, methods=table
+    )
     return make(COUNTS).picture
 
 
@@ -76,8 +77,9 @@ def test_settings_without_configure_are_refused_with_the_name_of_the_plugin() ->
     method = replace(find_method("fista"), settings=(TAU,))
     recipe = Recipe("fista", 1, settings=(("tau", 1.0),))
     with pytest.raises(SettingError, match="no `configure`") as refused:
-        Reconstructor(CALIBRATION, SHAPE, scenes.PLANNER, scenes.VirtualClock(), (recipe,), timed=False,
-                      methods={"fista": method})  # fmt: skip
+        Reconstructor(
+            CALIBRATION, SHAPE, scenes.PLANNER, scenes.VirtualClock(), (recipe,), timed=False, methods={"fista": method}
+        )
     assert "fista" in refused.value.message
 
 

@@ -90,9 +90,10 @@ def test_a_reading_above_a_limit_is_no_go_and_says_which() -> None:
     assert run.permitted_uw < run.assumed_uw
     head = Path("head.toml")
     for shown_uw, go, says in [
-        (run.expected_uw, True, "1 times"), (3 * run.expected_uw, True, "look at polarisers"),
+        (run.expected_uw, True, "1 times"),
+        (3 * run.expected_uw, True, "look at polarisers"),
         (1.01 * run.permitted_uw, False, "an eye may have"),
-    ]:  # fmt: skip
+    ]:
         verdict = judge_reading(run, shown_uw, peak=True)
         assert verdict.is_go == go
         assert says in words(head, run, verdict)

@@ -81,9 +81,12 @@ def picture(
     reconstruct: Reconstructor, counts: Counts, task: KnownRefraction, deadline: Deadline | None = None
 ) -> Reconstruction:
     *_, made = reconstruct.steps(
-        counts, simulated=True, deadline=deadline, rounds=ROUNDS,
+        counts,
+        simulated=True,
+        deadline=deadline,
+        rounds=ROUNDS,
         refraction=task,  # type: ignore[arg-type]  # a stand-in, whose results need no thread
-    )  # fmt: skip
+    )
     assert isinstance(made, Reconstruction)
     return made
 
@@ -162,9 +165,12 @@ def test_the_other_frames_of_a_burst_join_the_refraction(reconstruct: Reconstruc
     scatter = FrameScatter(3, 0.12, 0.05)
     task = KnownRefraction(replace(refraction(cylinder()), scatter=scatter))
     *_, made = reconstruct.steps(
-        counts, simulated=True, rounds=1, others=[counts, counts],
+        counts,
+        simulated=True,
+        rounds=1,
+        others=[counts, counts],
         refraction=task,  # type: ignore[arg-type]  # a stand-in, whose results need no thread
-    )  # fmt: skip
+    )
     assert isinstance(made, Reconstruction)
     assert len(task.others) == 2
     stated = made.report.refraction_scatter

@@ -136,9 +136,12 @@ def test_rounds_of_total_variation_are_those_of_the_textbook() -> None:
     """NUMERICS.md 4.2, on a cropped field with dead columns; single against double precision."""
     shape = (64, 80)
     calibration = scenes.calibration(
-        scenes.speckle((64, 64)), sensor=Sensor(gain_e_per_dn=2.0, read_noise_e=3.0), geometry=scenes.GEOMETRY,
-        field_deg=14.0, bad=np.arange(80)[None] * np.ones((64, 1), int) == 30,
-    )  # fmt: skip
+        scenes.speckle((64, 64)),
+        sensor=Sensor(gain_e_per_dn=2.0, read_noise_e=3.0),
+        geometry=scenes.GEOMETRY,
+        field_deg=14.0,
+        bad=np.arange(80)[None] * np.ones((64, 1), int) == 30,
+    )
     method = METHODS["variation"]
     model = method.model(calibration, shape, 1, scenes.PLANNER, 0)
     solver = method.build(model, calibration, scenes.PLANNER)

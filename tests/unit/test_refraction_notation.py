@@ -30,9 +30,10 @@ def test_sphere_and_cylinder_have_the_power_vector_they_came_from(m_dpt: float, 
     lens = sphere_cylinder(m_dpt, j0_dpt, j45_dpt)
     turn = math.radians(2 * lens.axis_deg)
     back = (
-        lens.sphere_dpt + lens.cylinder_dpt / 2, -lens.cylinder_dpt / 2 * math.cos(turn),
+        lens.sphere_dpt + lens.cylinder_dpt / 2,
+        -lens.cylinder_dpt / 2 * math.cos(turn),
         -lens.cylinder_dpt / 2 * math.sin(turn),
-    )  # fmt: skip
+    )
     assert back == pytest.approx((m_dpt, j0_dpt, j45_dpt), abs=1e-9)  # rounding of float64
     assert lens.cylinder_dpt <= 0
     assert 0 < lens.axis_deg <= 180
@@ -59,5 +60,12 @@ def test_without_a_cylinder_only_its_figures_are_null() -> None:
     report = report_of(found(-1.0, None))
     assert report["sphere"] == 1.0
     assert {key for key, value in report.items() if value is None} == {
-        "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "refused",
-    }  # fmt: skip
+        "j0",
+        "j0_sd",
+        "j45",
+        "j45_sd",
+        "sphere_sc",
+        "cylinder",
+        "axis_deg",
+        "refused",
+    }

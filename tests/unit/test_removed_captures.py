@@ -40,9 +40,14 @@ def visit(finished_at: datetime | None) -> Visit:
 
 @pytest.mark.parametrize(
     ("finished_at", "sent", "exported_state", "reason"),
-    [(NOON, ("v",), None, "sent"), (NOON, (), NOON, "exported"), (NOON, (), None, None), (None, ("v",), NOON, None),
-     (NOON, (), NOON - timedelta(seconds=1), None)],
-)  # fmt: skip
+    [
+        (NOON, ("v",), None, "sent"),
+        (NOON, (), NOON, "exported"),
+        (NOON, (), None, None),
+        (None, ("v",), NOON, None),
+        (NOON, (), NOON - timedelta(seconds=1), None),
+    ],
+)
 def test_only_a_confirmed_copy_of_the_present_state_permits_a_removal(
     finished_at: datetime | None, sent: tuple[str, ...], exported_state: datetime | None, reason: str | None
 ) -> None:

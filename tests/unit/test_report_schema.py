@@ -17,8 +17,12 @@ from services.records.capture_report import report_as_json
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 KEPT = sorted(GOLDEN.glob("kept*/data/captures/*/report.json"))
-NESTED = {"seconds": report_schema.SECONDS, "quality": report_schema.QUALITY,
-          "regularisation": report_schema.REGULARISATION, "refraction_dpt": report_schema.REFRACTION}  # fmt: skip
+NESTED = {
+    "seconds": report_schema.SECONDS,
+    "quality": report_schema.QUALITY,
+    "regularisation": report_schema.REGULARISATION,
+    "refraction_dpt": report_schema.REFRACTION,
+}
 
 
 def described(schema: Mapping[str, object], at: str = "") -> Iterator[str]:

@@ -23,9 +23,12 @@ from services.records.visit import SlotState, Visit
 from services.records.visit_repository import VisitRepository
 
 STORED: dict[str, Any] = {
-    "method": "variation", "seconds": {"expose": 0.5, "solve": 2}, "dose_24h_j_per_cm2": {"OD": 0.25, "OS": 0},
-    "verdict": {"word": "good", "code": None, "numbers": {"lit": 1}, "sharpness": 3}, "note": ["kept"],
-}  # fmt: skip
+    "method": "variation",
+    "seconds": {"expose": 0.5, "solve": 2},
+    "dose_24h_j_per_cm2": {"OD": 0.25, "OS": 0},
+    "verdict": {"word": "good", "code": None, "numbers": {"lit": 1}, "sharpness": 3},
+    "note": ["kept"],
+}
 
 
 def on_the_wire(report: dict[str, Any]) -> Any:
@@ -70,13 +73,15 @@ def test_a_visit_with_an_impossible_answer_is_damaged(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("message", "shown"),
     [
-        ("the disk refused: [Errno 28] No space left on device: '/data/store/captures/.a.part/b.json'",
-         "the disk refused: [Errno 28] No space left on device: 'b.json'"),
+        (
+            "the disk refused: [Errno 28] No space left on device: '/data/store/captures/.a.part/b.json'",
+            "the disk refused: [Errno 28] No space left on device: 'b.json'",
+        ),
         ("/boot/chooser/diffuscope.toml, line 3: no", "diffuscope.toml, line 3: no"),
         ("'/media/me/USB STICK/a b.tiff' and /srv/x/y.npy", "'a b.tiff' and y.npy"),
         ("GET /api/nothing/x: Not Found", "GET /api/nothing/x: Not Found"),
         ("https://reader.org/inbox/a answers 5 / 6 of 1/2", "https://reader.org/inbox/a answers 5 / 6 of 1/2"),
     ],
-)  # fmt: skip
+)
 def test_a_message_names_files_without_their_folders(message: str, shown: str) -> None:
     assert json.loads(problem_response(StoreError(message)).body)["message"] == shown

@@ -221,7 +221,7 @@ HOSTILE: dict[str, Callable[[Files], bytes]] = {
     "a manifest of something else": lambda files: zipped(
         {"manifest.toml": archive_module.sealed("format = 1\nsha256 = 3\nid = 4")}
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", HOSTILE)

@@ -76,9 +76,13 @@ class Run:
         light = GuardedLight(SimLight(self.world), self.clock, 1.0, hazard_of(of.spec), MemoryLedger(self.clock))
         self.placed: list[tuple[TrialLens, float]] = []
         self.head = Head(
-            of.spec, SimCamera(self.world), light, calibration, Chips(memory=SimHeadMemory(self.world)),
+            of.spec,
+            SimCamera(self.world),
+            light,
+            calibration,
+            Chips(memory=SimHeadMemory(self.world)),
             place_trial_lens=lambda lens, mm: self.placed.append((lens, mm)),
-        )  # fmt: skip
+        )
         parts = RunParts(of.spec, self.archive, self.clock, Watchdog(None), self.no_bench, lambda: self.head)
         self.session = TrialLensSession(parts, TrialLensRequest(LensBench()), self.end, self.measure)
 

@@ -60,9 +60,12 @@ def test_a_lens_has_the_power_vector_of_its_prescription() -> None:
 
 
 def readings(
-    off: PowerVector = EMMETROPIC, slope: float = 1.0, turned_deg: float = 0.0, stronger_dpt: float = 0.0,
+    off: PowerVector = EMMETROPIC,
+    slope: float = 1.0,
+    turned_deg: float = 0.0,
+    stronger_dpt: float = 0.0,
     seed: int | None = None,
-) -> list[LensReading]:  # fmt: skip
+) -> list[LensReading]:
     """Return the readings of a head with these errors; with a seed, with noise of the stated sds."""
     draw = np.random.default_rng(seed)
     found = []

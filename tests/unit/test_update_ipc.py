@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from device.clock import boot_id
 from services.errors import UpdateRequestInvalid
-from services.update.ipc import (  # fmt: skip
+from services.update.ipc import (
     MAX_REQUEST_BYTES,
     REQUEST_FILE,
     STATE_FILE,
@@ -52,11 +52,19 @@ def test_journal_with_fields_of_a_later_release_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        "", "{", "[]", "null", '{"form": 2}', '{"state": "on fire"}', '{"share": 7}', '{"share": "NaN"}',
-        '{"found": [{"id": "../../etc/passwd", "where": "stick", "bytes": 1}]}', json.dumps({"version": "x" * 70_000}),
+        "",
+        "{",
+        "[]",
+        "null",
+        '{"form": 2}',
+        '{"state": "on fire"}',
+        '{"share": 7}',
+        '{"share": "NaN"}',
+        '{"found": [{"id": "../../etc/passwd", "where": "stick", "bytes": 1}]}',
+        json.dumps({"version": "x" * 70_000}),
         WHOLE.model_dump_json()[:-9],
     ],
-)  # fmt: skip
+)
 def test_unreadable_journal_counts_as_the_default(tmp_path: Path, content: str) -> None:
     (tmp_path / STATE_FILE).write_text(content)
     assert read_state(tmp_path) == UpdateState()
@@ -74,12 +82,22 @@ def test_request_is_taken_once(tmp_path: Path, update_request: UpdateRequest) ->
 
 
 HOSTILE = [
-    "", "{", "[]", '{"do": "check"', '{"do": "check", "form": 2}', '{"do": "reboot"}', '{"do": "install"}',
-    '{"do": "check", "id": "0123456789abcdef"}', '{"do": "install", "id": "../../../etc/shadow"}',
-    '{"do": "install", "id": "/media/STICK/two.raucb"}', '{"do": "install", "id": "0123456789ABCDEF"}',
-    '{"do": "install", "id": "0123456789abcdef\\n"}', '{"do": "check", "path": "/etc/shadow"}', "\x00" * 10,
+    "",
+    "{",
+    "[]",
+    '{"do": "check"',
+    '{"do": "check", "form": 2}',
+    '{"do": "reboot"}',
+    '{"do": "install"}',
+    '{"do": "check", "id": "0123456789abcdef"}',
+    '{"do": "install", "id": "../../../etc/shadow"}',
+    '{"do": "install", "id": "/media/STICK/two.raucb"}',
+    '{"do": "install", "id": "0123456789ABCDEF"}',
+    '{"do": "install", "id": "0123456789abcdef\\n"}',
+    '{"do": "check", "path": "/etc/shadow"}',
+    "\x00" * 10,
     json.dumps({"do": "check"}) + " " * MAX_REQUEST_BYTES,
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("content", HOSTILE)

@@ -48,9 +48,12 @@ def site(keys: Path) -> Iterator[Site]:
 
 def offer(content: bytes, version: str = "2.0") -> Offer:
     return Offer(
-        compatible="diffuscope-pi5", version=version, bundle="two.raucb", bytes=len(content),
+        compatible="diffuscope-pi5",
+        version=version,
+        bundle="two.raucb",
+        bytes=len(content),
         sha256=hashlib.sha256(content).hexdigest(),
-    )  # fmt: skip
+    )
 
 
 def silent(share: float, what: str) -> None:

@@ -123,9 +123,13 @@ def test_a_truncated_upload_is_not_confirmed(
     ],
 )
 def test_each_http_status_has_its_error(
-    receiver: Receiver, certificate: tuple[Path, Path], tmp_path: Path, method: str, status: int,
+    receiver: Receiver,
+    certificate: tuple[Path, Path],
+    tmp_path: Path,
+    method: str,
+    status: int,
     kind: type[DiffuscopeError],
-) -> None:  # fmt: skip
+) -> None:
     receiver.answers[method] = status
     with pytest.raises(kind, match=str(status)):
         deliver(uploader_of(receiver, certificate, tmp_path))

@@ -26,10 +26,14 @@ from tests.companions import add_companions, apple_double
 
 TEXT = '# clínica\nname = "á"\n'
 READERS: dict[str, Callable[[Path], Any]] = {
-    "head": load_head, "sensor": lambda path: sensor_profile(path.name, path.parent),
-    "light path": load_light_path, "programme": load_protocol, "upload": load_upload_settings,
-    "update": load_update_settings, "plan": read_plan,
-}  # fmt: skip
+    "head": load_head,
+    "sensor": lambda path: sensor_profile(path.name, path.parent),
+    "light path": load_light_path,
+    "programme": load_protocol,
+    "upload": load_upload_settings,
+    "update": load_update_settings,
+    "plan": read_plan,
+}
 
 
 def test_a_list_has_no_hidden_files_and_none_of_hidden_folders(tmp_path: Path) -> None:
@@ -60,14 +64,17 @@ def test_utf_8_is_read_with_and_without_a_mark(tmp_path: Path, encoding: str) ->
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (TEXT.encode("utf-16"), "saved as UTF-16"), (TEXT.encode("utf-16-le"), "saved as UTF-16"),
-        (TEXT.encode("utf-16-be"), "saved as UTF-16"), (TEXT.encode("utf-32"), "saved as UTF-16"),
+        (TEXT.encode("utf-16"), "saved as UTF-16"),
+        (TEXT.encode("utf-16-le"), "saved as UTF-16"),
+        (TEXT.encode("utf-16-be"), "saved as UTF-16"),
+        (TEXT.encode("utf-32"), "saved as UTF-16"),
         (b"\xfe\xff" + TEXT.encode("utf-16-be"), "saved as UTF-16"),
         (TEXT.encode("latin-1"), "line 1: the byte 0xED is not UTF-8, .* Latin-1"),
         (b"a = 1\n" + TEXT.encode("cp1252"), "line 2: the byte 0xED"),
-        (b"a = 1\n" + bytes(4096), "zero bytes"), (apple_double(), "companion that macOS wrote"),
+        (b"a = 1\n" + bytes(4096), "zero bytes"),
+        (apple_double(), "companion that macOS wrote"),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("reader", READERS)
 def test_every_reader_says_what_is_wrong_with_the_text(
     tmp_path: Path, reader: str, content: bytes, reason: str

@@ -22,14 +22,29 @@ from device.values import (
     Report,
     Sensor,
     check_image_shape,
-)  # fmt: skip
+)
 from services.records.capture import Capture
 
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4)
 DESIGNED = [  # public interface: keys of report.json
-    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
-    "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "frames", "channels",
-]  # fmt: skip
+    "method",
+    "bin",
+    "rounds",
+    "stopped",
+    "seconds",
+    "psf_index",
+    "psf_scale",
+    "psf_cylinder",
+    "refraction_dpt",
+    "refraction_scatter",
+    "regularisation",
+    "noise_dn",
+    "residual",
+    "quality",
+    "warnings",
+    "frames",
+    "channels",
+]
 
 
 def frame(counts: Any = COUNTS) -> Frame:
@@ -128,12 +143,20 @@ def test_a_calibration_needs_psfs_of_one_size() -> None:
 
 COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
 COLOURED: tuple[tuple[str, Colour | None], ...] = (
-    ("every", None), ("near", "green"), ("far", "green"), ("red", "red"),
-)  # fmt: skip
+    ("every", None),
+    ("near", "green"),
+    ("far", "green"),
+    ("red", "red"),
+)
 CHANGES: dict[str, Any] = {
-    "psfs": (Psf(psf() ** 2),), "sensor": Sensor(black_dn=1), "geometry": Geometry(5, 6000, 0.75), "field_deg": 33.0,
-    "dark_dn": psf(), "flat": psf(), "bad": psf() > 0.5,
-}  # fmt: skip
+    "psfs": (Psf(psf() ** 2),),
+    "sensor": Sensor(black_dn=1),
+    "geometry": Geometry(5, 6000, 0.75),
+    "field_deg": 33.0,
+    "dark_dn": psf(),
+    "flat": psf(),
+    "bad": psf() > 0.5,
+}
 
 
 @pytest.mark.parametrize("what", CHANGES)

@@ -206,9 +206,14 @@ def test_an_idempotency_key_belongs_to_one_request(people: VisitRepository) -> N
 
 @pytest.mark.parametrize(
     ("change", "named"),
-    [('vision_limit = "6/7"', "vision_limit"), ('eye = "both"', "eye"), ('id = "R-centre"', "same id"),
-     ("retakes = -1", "retakes"), ('colour = "green"', "not a known key")],
-)  # fmt: skip
+    [
+        ('vision_limit = "6/7"', "vision_limit"),
+        ('eye = "both"', "eye"),
+        ('id = "R-centre"', "same id"),
+        ("retakes = -1", "retakes"),
+        ('colour = "green"', "not a known key"),
+    ],
+)
 def test_an_invalid_protocol_is_refused_with_the_key_of_the_mistake(tmp_path: Path, change: str, named: str) -> None:
     key = change.split(" ")[0]
     lines = [change if line.startswith(f"{key} ") else line for line in DEFAULT_PROTOCOL.read_text().splitlines()]
@@ -224,15 +229,18 @@ def test_an_invalid_protocol_is_refused_with_the_key_of_the_mistake(tmp_path: Pa
         "INSERT INTO visits (id, person, day, begun_at) VALUES ('v', 'no one', '2026-01-01', 'x')",
         "INSERT INTO persons (number, made_at) VALUES ('', 'x')",
         "INSERT INTO persons (number, made_at) VALUES ('123456789012345678901', 'x')",
-        "UPDATE visits SET finished_at = 'x'", "UPDATE visits SET outcome = '{}'", "DELETE FROM persons",
+        "UPDATE visits SET finished_at = 'x'",
+        "UPDATE visits SET outcome = '{}'",
+        "DELETE FROM persons",
         "INSERT INTO fields SELECT id, 'age', 'fifty', 'x' FROM visits",
         "INSERT INTO slots SELECT id, 'R-centre', 'no capture', NULL FROM visits",
-        "INSERT INTO keys VALUES ('short', 'a', 'b', 'c')", "UPDATE counters SET last = 'many'",
+        "INSERT INTO keys VALUES ('short', 'a', 'b', 'c')",
+        "UPDATE counters SET last = 'many'",
         "INSERT INTO sendings SELECT id, 'x', -1, NULL, NULL, NULL, NULL, NULL, NULL FROM visits",
         "INSERT INTO sendings SELECT id, 'x', 1, NULL, NULL, NULL, 'today', NULL, NULL FROM visits",
         "INSERT INTO sendings VALUES ('no visit', 'x', 1, NULL, NULL, NULL, NULL, NULL, NULL)",
     ],
-)  # fmt: skip
+)
 def test_the_constraints_of_the_tables_refuse_invalid_rows(
     store: CaptureStore, people: VisitRepository, statement: str
 ) -> None:

@@ -32,9 +32,12 @@ class DarkFrameAssessment:
 
 
 def assess_dark_frame(
-    calibration: Calibration, provenance: Provenance | None, counts: Counts, exposure_s: float,
+    calibration: Calibration,
+    provenance: Provenance | None,
+    counts: Counts,
+    exposure_s: float,
     between: Callable[[], None] = lambda: None,
-) -> DarkFrameAssessment:  # fmt: skip
+) -> DarkFrameAssessment:
     """Return the assessment of a dark frame (rows, cols) of `exposure_s`; `between` is called between its steps."""
     figures = dict(provenance.figures) if provenance is not None else {}
     gain, black_dn = calibration.sensor.gain_e_per_dn, calibration.sensor.black_dn

@@ -86,9 +86,12 @@ class ReportedRefraction:
 
 
 def assess_capture(
-    calibration: Calibration, provenance: Provenance | None, witness: PsfMatchTest | None, exposures: ExposurePair,
+    calibration: Calibration,
+    provenance: Provenance | None,
+    witness: PsfMatchTest | None,
+    exposures: ExposurePair,
     between: Callable[[], None] = lambda: None,
-) -> CaptureAssessment:  # fmt: skip
+) -> CaptureAssessment:
     """Return the assessment of one capture; `witness` is the PSF match test (None: the PSF is not tested).
 
     `between` is called every few milliseconds and may abort the assessment by raising an exception.
@@ -101,9 +104,12 @@ def assess_capture(
 
 
 def check(
-    calibration: Calibration, provenance: Provenance | None, assessments: Sequence[CaptureAssessment],
-    refractions: Sequence[ReportedRefraction], now: datetime,
-) -> tuple[Finding, ...]:  # fmt: skip
+    calibration: Calibration,
+    provenance: Provenance | None,
+    assessments: Sequence[CaptureAssessment],
+    refractions: Sequence[ReportedRefraction],
+    now: datetime,
+) -> tuple[Finding, ...]:
     """Return the findings on age, PSF, field, refraction and darks for which the data suffice; input in any order."""
     recent = sorted(assessments, key=lambda one: one.taken_at)
     statements = [one.statement for one in recent if one.statement is not None and one.statement.sd <= MAX_SCORE_SD]
@@ -174,9 +180,12 @@ def _scale_finding(persons: Sequence[float]) -> Finding:
     """Return the finding on the median refraction of many patients: near zero, unless the relay has moved."""
     limit_dpt = SLACK_DPT + 3 * 1.25 * POPULATION_SD_DPT / len(persons) ** 0.5  # 1.25: a median's spread over a mean's
     return _hint(
-        "scale", abs(median(persons)), limit_dpt, "dpt",
+        "scale",
+        abs(median(persons)),
+        limit_dpt,
+        "dpt",
         "Most eyes seem to have the same refraction: the relay may have moved. Look at a model eye.",
-    )  # fmt: skip
+    )
 
 
 def _edge_finding(calibrated_deg: float, sittings: Sequence[Sequence[ReportedRefraction]]) -> Finding:
@@ -188,10 +197,13 @@ def _edge_finding(calibrated_deg: float, sittings: Sequence[Sequence[ReportedRef
     variance_deg2 = float(np.mean([median(one.field_deg_sd for one in sitting) ** 2 for sitting in sittings]))
     limit_deg = EDGE_SLACK_DEG + 2 * 1.25 * (variance_deg2 / len(sittings)) ** 0.5
     return _hint(
-        "edge", abs(median(found_deg) - calibrated_deg), limit_deg, "deg",
+        "edge",
+        abs(median(found_deg) - calibrated_deg),
+        limit_deg,
+        "deg",
         "The lit field has another diameter than the calibration in several eyes: see whether the stop or the lamp was "
         "changed or moved, and calibrate the head.",
-    )  # fmt: skip
+    )
 
 
 def _sittings(refractions: Sequence[ReportedRefraction]) -> list[list[ReportedRefraction]]:
@@ -213,9 +225,15 @@ def _dark_findings(calibration: Calibration, darks: Sequence[DarkFrameAssessment
     warmth_dn = median(one.dark_current_dn for one in darks)
     found = [
         _hot_pixel_finding(hot),
-        _hint("black level", off_dn, BLACK_DN + warmth_dn, "DN", "The dark is not as dark as it was. Every picture "
-                "has a dark frame of its own, so it stays true; but shade the head, let it cool, and look again."),
-    ]  # fmt: skip
+        _hint(
+            "black level",
+            off_dn,
+            BLACK_DN + warmth_dn,
+            "DN",
+            "The dark is not as dark as it was. Every picture "
+            "has a dark frame of its own, so it stays true; but shade the head, let it cool, and look again.",
+        ),
+    ]
     noises = [one.noise_ratio for one in darks if one.noise_ratio is not None]
     if noises:
         remedy = "The sensor is noisier than it was: shade the head, let it cool, and look again."

@@ -38,12 +38,24 @@ from device.ports import Camera, Thermometer
 from device.values import Calibration, Colour, Frame, Geometry, Psf, Sensor
 
 CalibrationTarget = Literal[
-    "cap", "screen", "point", "point -4 mm", "point -2 mm", "point +2 mm", "point +4 mm",
-    "point red", "point green", "point blue", "point amber",
-]  # fmt: skip
+    "cap",
+    "screen",
+    "point",
+    "point -4 mm",
+    "point -2 mm",
+    "point +2 mm",
+    "point +4 mm",
+    "point red",
+    "point green",
+    "point blue",
+    "point amber",
+]
 COLOUR_TARGETS: dict[Colour, CalibrationTarget] = {
-    "red": "point red", "green": "point green", "blue": "point blue", "amber": "point amber",
-}  # fmt: skip
+    "red": "point red",
+    "green": "point green",
+    "blue": "point blue",
+    "amber": "point amber",
+}
 AXIAL_OFFSETS_MM: dict[CalibrationTarget, float] = {
     "point -4 mm": -4.0,
     "point -2 mm": -2.0,

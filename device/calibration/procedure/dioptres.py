@@ -122,8 +122,9 @@ def fit_dioptre_scale(scales: Mapping[float, float], eye_mm: float) -> DioptreSc
     if abs(off_dpt[worst]) > MOST_OFF_DPT:
         raise CalibrationRefused(
             f"at {list(scales)[worst]:+g} mm the PSF is {off_dpt[worst]:+.2f} dpt beside the line of all places "
-            f"(at most {MOST_OFF_DPT})", REMEDY,
-        )  # fmt: skip
+            f"(at most {MOST_OFF_DPT})",
+            REMEDY,
+        )
     sd = abs(factor) * sqrt(float(off_dpt @ off_dpt) / (len(scales) - 1) / squares)
     return DioptreScale(factor, sd, float(off_dpt[worst]))
 

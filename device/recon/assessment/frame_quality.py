@@ -27,9 +27,17 @@ from device.values import Calibration, Image
 
 Word = Literal["good", "again"]
 Code = Literal[
-    "shot.saturated", "shot.dark", "shot.moved", "shot.noeye", "shot.pupil", "shot.blink", "shot.edge", "shot.halo",
-    "shot.poor", "make.failed",
-]  # fmt: skip
+    "shot.saturated",
+    "shot.dark",
+    "shot.moved",
+    "shot.noeye",
+    "shot.pupil",
+    "shot.blink",
+    "shot.edge",
+    "shot.halo",
+    "shot.poor",
+    "make.failed",
+]
 
 # Limits. Detection and false-alarm rates: tests/hard/test_frame_quality.py.
 # `wide` of a saturated frame: overexposure flattens its middle; a reflex, which is small, does not.
@@ -225,10 +233,14 @@ class _CoarseField:
             for along in (self._right, self._down)
         )
         return replace(
-            brightness, through=1 - solver.stray / frame.mean_dn, coverage=solver.diagnostics.quality["coverage"],
-            off_x=off_x, off_y=off_y, smear=self._smear(shown),
+            brightness,
+            through=1 - solver.stray / frame.mean_dn,
+            coverage=solver.diagnostics.quality["coverage"],
+            off_x=off_x,
+            off_y=off_y,
+            smear=self._smear(shown),
             wide=_rms_radius(frame.y - solver.stray) / self._even_radius,
-        )  # fmt: skip
+        )
 
     def _smear(self, shown: Image) -> float | None:
         """Return the directional dependence of the detail's power: 0 for none, 1 for one direction; None if dark."""

@@ -70,9 +70,10 @@ class Signs:
             return 0.0
         peak, rival = max(self.peak, FAINT), max(self.rival, FAINT)
         weakest = min(
-            PEAK_STEEP * log(peak / PEAK), RIVAL_STEEP * log(peak / rival / RIVAL),
+            PEAK_STEEP * log(peak / PEAK),
+            RIVAL_STEEP * log(peak / rival / RIVAL),
             MACULA_STEEP * (self.macula - MACULA),
-        )  # fmt: skip
+        )
         return 1 / (1 + exp(-weakest))
 
 

@@ -81,9 +81,11 @@ class Consistency:
     def report_figures(self) -> dict[str, float | None]:
         """The figures by their names in a report."""
         return {
-            "psf_score": self.score, "psf_score_sd": self.score_sd,
-            "psf_orientation": self.orientation, "psf_mirrored": self.mirrored,
-        }  # fmt: skip
+            "psf_score": self.score,
+            "psf_score_sd": self.score_sd,
+            "psf_orientation": self.orientation,
+            "psf_mirrored": self.mirrored,
+        }
 
     @property
     def match(self) -> Match:

@@ -189,9 +189,14 @@ class DefectFinder:
         """
         limit = NOISE_SD**2 * float(LINE)
         return kernels.mark_suspects(
-            counts, offset, limit * noise.per_dn, limit * noise.floor_dn2, self._white_dn,
-            self._least_dn(offset, noise), self._suspect,
-        )  # fmt: skip
+            counts,
+            offset,
+            limit * noise.per_dn,
+            limit * noise.floor_dn2,
+            self._white_dn,
+            self._least_dn(offset, noise),
+            self._suspect,
+        )
 
     def _add_areas(
         self, counts: Pixels, dark: Pixels | None, noise: PixelNoise, defective: Mask, gap: bool, saturated: bool

@@ -221,9 +221,13 @@ class RefractionEstimator:
             return NoRefraction(f"the refractions of the frames scatter by {scatter.sd_dpt:.1f} dpt")
         m_dpt, j0_dpt, j45_dpt = (eye_dpt + (steps_dpt - steps_dpt[0]).mean(axis=0)).tolist()
         return replace(
-            found, sphere_dpt=m_dpt, sd_dpt=found.sd_dpt * scatter.growth, psf_scale=self.scale(m_dpt),
-            cylinder=replace(cylinder, j0_dpt=j0_dpt, j45_dpt=j45_dpt), scatter=scatter,
-        )  # fmt: skip
+            found,
+            sphere_dpt=m_dpt,
+            sd_dpt=found.sd_dpt * scatter.growth,
+            psf_scale=self.scale(m_dpt),
+            cylinder=replace(cylinder, j0_dpt=j0_dpt, j45_dpt=j45_dpt),
+            scatter=scatter,
+        )
 
     @property
     def _is_refined(self) -> bool:
@@ -250,10 +254,13 @@ class RefractionEstimator:
             eye_dpt, sds_dpt = refined.eye_dpt, np.hypot(refined.sds_dpt, (found.missing_sd_dpt, 0, 0))
         (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = eye_dpt.tolist(), sds_dpt.tolist()
         return replace(
-            found, sphere_dpt=m_dpt, sd_dpt=sd_dpt, psf_scale=self.scale(m_dpt),
+            found,
+            sphere_dpt=m_dpt,
+            sd_dpt=sd_dpt,
+            psf_scale=self.scale(m_dpt),
             edge=self._edges.field_edge(self._edges.edge_model(eye_dpt)),
             cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
-        )  # fmt: skip
+        )
 
     def _alternate(self, m_dpt: float) -> tuple[float, float]:
         """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on.

@@ -178,8 +178,9 @@ class CropModel:
         above, below = (
             likelihood.interpolated_otf.on_grid(
                 self._grid.shape, self._grid.n, transform(likelihood.geometry, *(eye_dpt + sign * step_dpt))
-            ) for sign in (1, -1)
-        )  # fmt: skip
+            )
+            for sign in (1, -1)
+        )
         return np.asarray((above - below) / np.float32(2 * DERIVATIVE_STEP_DPT), np.complex64)
 
     def _spectrum(self, image: Image) -> Spectrum:

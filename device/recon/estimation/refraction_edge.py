@@ -71,9 +71,14 @@ class EdgeLikelihood:
     """
 
     def __init__(
-        self, calibration: Calibration, geometry: Geometry, shape: Pair, planner: Planner, index: int,
+        self,
+        calibration: Calibration,
+        geometry: Geometry,
+        shape: Pair,
+        planner: Planner,
+        index: int,
         edge_is_known: bool,
-    ) -> None:  # fmt: skip
+    ) -> None:
         assert calibration.field_deg is not None
         self._count = 0 if edge_is_known else PARAMETERS
         wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
@@ -159,9 +164,17 @@ class EdgeLikelihood:
         """Return the negative log likelihood of a residual; the levels, energies and powers of the band are kept."""
         band = self.band
         return fused_kernels.negative_log_likelihood(
-            rest[None], otf, self._flat_places, band.ring, self._noise_dn2, SMEAR, TURNS, self.levels, band.energy,
+            rest[None],
+            otf,
+            self._flat_places,
+            band.ring,
+            self._noise_dn2,
+            SMEAR,
+            TURNS,
+            self.levels,
+            band.energy,
             band.power,
-        )  # fmt: skip
+        )
 
     def _candidate(self, nats: float) -> Candidate:
         model = self._spectrum()

@@ -53,9 +53,11 @@ class Edge:
         slope = np.float32(0.5 * np.pi) * np.sin(np.pi * ramp) / width
         outward = slope / np.maximum(radius, 1)
         return (
-            slope, outward * (rows - np.float32(self.down_samples)), outward * (cols - np.float32(self.right_samples)),
+            slope,
+            outward * (rows - np.float32(self.down_samples)),
+            outward * (cols - np.float32(self.right_samples)),
             slope * (np.float32(0.5) - ramp),
-        )  # fmt: skip
+        )
 
     def _ramp(self, rows: Image, cols: Image) -> tuple[Image, Image, np.float32]:
         radius = np.hypot(rows - np.float32(self.down_samples), cols - np.float32(self.right_samples))

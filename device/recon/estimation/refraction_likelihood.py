@@ -116,9 +116,14 @@ class RefractionLikelihood:
     """Negative log likelihood of a mean sphere M for PSF `index` of one calibration, and one sensor shape."""
 
     def __init__(
-        self, calibration: Calibration, geometry: Geometry, shape: Pair, planner: Planner, index: int,
+        self,
+        calibration: Calibration,
+        geometry: Geometry,
+        shape: Pair,
+        planner: Planner,
+        index: int,
         sample_um: float = SAMPLE_UM,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.geometry, self.sensor = geometry, calibration.sensor
         self.interpolated_otf = InterpolatedOtf(calibration.psfs[index])
         n = max(1, min(round(sample_um / geometry.pitch_um), min(shape) // 16))

@@ -16,9 +16,19 @@ from device.recon.estimation.refraction import NoRefraction, Refraction
 
 SCATTER_KEYS = ("frames", "sd_dpt", "stated_sd_dpt", "chi2")
 REFRACTION_KEYS = (
-    "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
+    "sphere",
+    "sd",
+    "j0",
+    "j0_sd",
+    "j45",
+    "j45_sd",
+    "sphere_sc",
+    "cylinder",
+    "axis_deg",
+    "field_deg",
+    "field_deg_sd",
     "refused",
-)  # fmt: skip
+)
 
 
 class SphereCylinder(NamedTuple):
@@ -45,15 +55,22 @@ def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]
     if isinstance(found, NoRefraction):
         return report | {"refused": found.reason}
     report |= {
-        "sphere": -found.sphere_dpt, "sd": found.sd_dpt,
-        "field_deg": found.edge.diameter_deg, "field_deg_sd": found.edge.diameter_sd_deg,
-    }  # fmt: skip
+        "sphere": -found.sphere_dpt,
+        "sd": found.sd_dpt,
+        "field_deg": found.edge.diameter_deg,
+        "field_deg_sd": found.edge.diameter_sd_deg,
+    }
     if (cylinder := found.cylinder) is not None:
         lens = sphere_cylinder(-found.sphere_dpt, -cylinder.j0_dpt, cylinder.j45_dpt)
         report |= {
-            "j0": -cylinder.j0_dpt, "j0_sd": cylinder.j0_sd_dpt, "j45": cylinder.j45_dpt, "j45_sd": cylinder.j45_sd_dpt,
-            "sphere_sc": lens.sphere_dpt, "cylinder": lens.cylinder_dpt, "axis_deg": lens.axis_deg,
-        }  # fmt: skip
+            "j0": -cylinder.j0_dpt,
+            "j0_sd": cylinder.j0_sd_dpt,
+            "j45": cylinder.j45_dpt,
+            "j45_sd": cylinder.j45_sd_dpt,
+            "sphere_sc": lens.sphere_dpt,
+            "cylinder": lens.cylinder_dpt,
+            "axis_deg": lens.axis_deg,
+        }
     return report
 
 

@@ -17,9 +17,13 @@ class RefractionTask:
     """
 
     def __init__(
-        self, estimator: RefractionEstimator, lock: Lock, clock: Clock,
-        frame: tuple[Pixels, Pixels | None, Places | None], with_cylinder: bool,
-    ) -> None:  # fmt: skip
+        self,
+        estimator: RefractionEstimator,
+        lock: Lock,
+        clock: Clock,
+        frame: tuple[Pixels, Pixels | None, Places | None],
+        with_cylinder: bool,
+    ) -> None:
         self._estimator, self._lock, self._clock, self._frame = estimator, lock, clock, frame
         self.find_s = self.cylinder_s = self.join_s = 0.0  # durations, once the results are there
         aside = ThreadPoolExecutor(1, "refraction")

@@ -65,9 +65,16 @@ def solve_data_step(blurred: Image, a: Image, weighted: Image, inverse: Image, s
 
 @compiled
 def data_weights(
-    blurred: Image, y: Image, good: Image, per_dn: float, floor: float, stiffness: float,
-    at: tuple[int, int], weighted: Image, inverse: Image,
-) -> None:  # fmt: skip
+    blurred: Image,
+    y: Image,
+    good: Image,
+    per_dn: float,
+    floor: float,
+    stiffness: float,
+    at: tuple[int, int],
+    weighted: Image,
+    inverse: Image,
+) -> None:
     """Write W y to `weighted` and 1/(W + r) to `inverse`, on the grid; `blurred` is Hx, `stiffness` is r.
     W = good / (per_dn max(Hx, 0) + floor), the share of good pixels over the noise variance, in the window; else 0.
     """
@@ -83,9 +90,17 @@ def data_weights(
 
 @compiled
 def solve_x_step(
-    data: Spectrum, image: Spectrum, otf: Spectrum, row_g: Image, col_g: Image,
-    stiffness: float, rho: float, scale: float, x: Spectrum, blurred: Spectrum,
-) -> None:  # fmt: skip
+    data: Spectrum,
+    image: Spectrum,
+    otf: Spectrum,
+    row_g: Image,
+    col_g: Image,
+    stiffness: float,
+    rho: float,
+    scale: float,
+    x: Spectrum,
+    blurred: Spectrum,
+) -> None:
     """Solve ADMM's x step in Fourier space: x = scale (r conj(H) data + rho image) / (r |H|^2 + rho |D|^2 + rho).
 
     The spectra of x and of H x are written to `x` and `blurred`. `row_g` and `col_g` are the parts of |D|^2, see
@@ -228,9 +243,17 @@ def stretched_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, sh
 
 @compiled
 def negative_log_likelihood(
-    seen: Spectrum, otf: Spectrum, where: NDArray[np.int64], ring: NDArray[np.int64], s2: float, smear: float,
-    turns: int, levels: Series, energy: Image, power: Image,
-) -> float:  # fmt: skip
+    seen: Spectrum,
+    otf: Spectrum,
+    where: NDArray[np.int64],
+    ring: NDArray[np.int64],
+    s2: float,
+    smear: float,
+    turns: int,
+    levels: Series,
+    energy: Image,
+    power: Image,
+) -> float:
     """Return the negative log likelihood of a spectrum under S = q g + s2, with the best level g of each ring.
 
     The result is sum(log S + |seen|^2 / S) in nats, NUMERICS.md 7.1. `otf` (H) belongs to the flat indices `where` of

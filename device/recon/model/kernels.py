@@ -101,9 +101,17 @@ def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tupl
 
 @compiled
 def exclude_pixels(
-    counts: Pixels, dark: Image, bend_per_dn: float, gain: Image, white_dn: float, first: tuple[int, int], n: int,
-    places: Places, out: Image, good: Image,
-) -> tuple[int, float]:  # fmt: skip
+    counts: Pixels,
+    dark: Image,
+    bend_per_dn: float,
+    gain: Image,
+    white_dn: float,
+    first: tuple[int, int],
+    n: int,
+    places: Places,
+    out: Image,
+    good: Image,
+) -> tuple[int, float]:
     """Remove the pixels `places` (flat indices) from the result of `linearise`; return their number and light in DN.
 
     The other arguments are those of `linearise`; `out` and `good` are updated in place. Pixels that it left out, and
@@ -268,9 +276,15 @@ def subtract_scaled(light: Image, smooth: Image, scale: float, good: Image, out:
 
 @compiled
 def add_moved(
-    image: Image, good: Image, whole: tuple[int, int], taps: Axes, weight: float, gain: float, total: Image,
+    image: Image,
+    good: Image,
+    whole: tuple[int, int],
+    taps: Axes,
+    weight: float,
+    gain: float,
+    total: Image,
     weights: Image,
-) -> None:  # fmt: skip
+) -> None:
     """Add weight gain image(r + shift) to `total`, and `weight` to `weights`, where the pixels under all taps are good.
 
     The shift is `whole` pixels, and the part of a pixel that `taps` interpolate: an odd number of weights per axis,
@@ -375,9 +389,16 @@ def _light(counts: Pixels, dark: Image, out: Image) -> None:
 
 @compiled
 def _mark_row(
-    counts: Pixels, above: Image, here: Image, below: Image, slope: Single, floor: Single, white: Single, least: Single,
+    counts: Pixels,
+    above: Image,
+    here: Image,
+    below: Image,
+    slope: Single,
+    floor: Single,
+    white: Single,
+    least: Single,
     out: Mask,
-) -> None:  # fmt: skip
+) -> None:
     quarter, zero = np.float32(0.25), np.float32(0)
     last = out.size - 1
     for j in range(1, last):  # selects instead of branches, as in `_add_row`
@@ -404,9 +425,15 @@ def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, ou
 
 @compiled
 def outliers(
-    counts: Pixels, dark: Image, known: Mask, places: Places, slope_dn: float, floor_dn2: float,
-    ranges: tuple[float, float], is_outlier: Mask,
-) -> int:  # fmt: skip
+    counts: Pixels,
+    dark: Image,
+    known: Mask,
+    places: Places,
+    slope_dn: float,
+    floor_dn2: float,
+    ranges: tuple[float, float],
+    is_outlier: Mask,
+) -> int:
     """Mark in `is_outlier` which pixels `places` (flat indices) differ from a ring around them; return their number.
 
     Marks are only set, never cleared; pixels in `known` are skipped and not counted. A ring is the 8 pixels at distance
@@ -436,7 +463,7 @@ def outliers(
 @compiled
 def ring_excess(
     image: Image, zero_row: Image, no_mask: Mask, least: float, slope_dn: float, floor_dn2: float
-) -> Series:  # fmt: skip
+) -> Series:
     """Return for each pixel of at least `least` the smallest pair `ranges` with which `outliers` does not mark it.
 
     The result is (pixels, 2). The two outermost rows and columns are left out. `zero_row` is a row of zeros, `no_mask`

@@ -98,11 +98,13 @@ class EvidenceWiener:
         self.diagnostics = Diagnostics(
             noise_dn=self.detail.noise.variance_dn2(mean) ** 0.5,
             regularisation={
-                "prior_slope": law.slope, "prior_log_power": law.log_power, "flat_dn": self.level,
+                "prior_slope": law.slope,
+                "prior_log_power": law.log_power,
+                "flat_dn": self.level,
                 "background_dn": self.stray,
             },
             quality=self._quality(fit, mean),
-        )  # fmt: skip
+        )
 
     def _add_diagnostics(self, added: Diagnostics) -> None:
         """Add parameters and quality figures to `diagnostics`, and the residual if there is one."""
@@ -271,9 +273,17 @@ class TotalVariation(EvidenceWiener):
         image.forward()
         data.forward()
         fused_kernels.solve_x_step(
-            data.spectrum, image.spectrum, model.otf, model.row_gradient, model.col_gradient,
-            self.stiffness, self.rho, 1 / model.grid.size, image.spectrum, data.spectrum,
-        )  # fmt: skip
+            data.spectrum,
+            image.spectrum,
+            model.otf,
+            model.row_gradient,
+            model.col_gradient,
+            self.stiffness,
+            self.rho,
+            1 / model.grid.size,
+            image.spectrum,
+            data.spectrum,
+        )
         self.x[:] = image.inverse()
         self.blurred[:] = data.inverse()
 

@@ -62,9 +62,16 @@ class OpenFieldTotalVariation(TotalVariation):
         self.stiffness = STIFF * self._typical
         self.blurred[grid.slices] = frame.y  # weights from the frame, not from the start with its zeros
         fused_kernels.data_weights(
-            self.blurred, self._y, frame.good, noise.per_dn, noise.floor_dn2, self.stiffness, grid.at,
-            self._weighted, self._inverse,
-        )  # fmt: skip
+            self.blurred,
+            self._y,
+            frame.good,
+            noise.per_dn,
+            noise.floor_dn2,
+            self.stiffness,
+            grid.at,
+            self._weighted,
+            self._inverse,
+        )
         self._darken_beyond_the_sensor()
         self._blur()
         self._done = 0

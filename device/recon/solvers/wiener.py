@@ -94,10 +94,13 @@ class ClosedForm:
             noise_dn=noise,
             residual=misfit / (noise * share**0.5) if noise > 0 else 0.0,
             regularisation={
-                "mu": mu, "gcv": score, "psf_error": prior.psf_error, "flat_dn": self._flat_dn,
+                "mu": mu,
+                "gcv": score,
+                "psf_error": prior.psf_error,
+                "flat_dn": self._flat_dn,
                 "background_dn": background,
             },
-        )  # fmt: skip
+        )
 
     def _load_frame(self, frame: Linear) -> tuple[float, float]:
         """Write the frame minus the flat model to the FFT input; return the flat's level and the background in DN.

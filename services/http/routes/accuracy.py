@@ -71,9 +71,14 @@ def explorer_answer(explorer: AccuracyExplorer) -> ExplorerAnswer:
     """Return the state of the accuracy explorer."""
     now = explorer.state()
     return ExplorerAnswer(
-        measured=now.measured, pace=now.pace, paces_s=dict(now.paces_s), busy=now.busy, said=now.progress,
-        scene=now.scene, problem=error_text(now.problem),
-    )  # fmt: skip
+        measured=now.measured,
+        pace=now.pace,
+        paces_s=dict(now.paces_s),
+        busy=now.busy,
+        said=now.progress,
+        scene=now.scene,
+        problem=error_text(now.problem),
+    )
 
 
 def _stored_frames(store: CaptureStore, id: str, seen: Calibration) -> StoredCapture:

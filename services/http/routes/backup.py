@@ -22,9 +22,13 @@ def backup_routes(runner: BackupRunner, store: CaptureStore, drives: UsbDrives, 
         unsaved_since = store.first_taken_after(None if now.last is None else now.last.made_at)
         done, total = now.progress or (None, None)
         return BackupAnswer(
-            has_key=now.has_key, last=last, is_due=thresholds.is_backup_due(clock.wall(), unsaved_since),
-            done=done, total=total, error=error_text(now.error),
-        )  # fmt: skip
+            has_key=now.has_key,
+            last=last,
+            is_due=thresholds.is_backup_due(clock.wall(), unsaved_since),
+            done=done,
+            total=total,
+            error=error_text(now.error),
+        )
 
     @router.get("")
     def state() -> BackupAnswer:

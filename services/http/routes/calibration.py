@@ -74,9 +74,13 @@ def _read_router(arbiter: HeadArbiter) -> APIRouter:
             return Response(status_code=204)
         age_ms = max(0, round((arbiter.context.clock.now_s() - frame.seen_s) * 1000))
         headers = {
-            "X-Frame": str(frame.number), "X-Age-Ms": str(age_ms), "X-Exposure-Ms": f"{frame.exposure_s * 1000:.3g}",
-            "X-Brightest": f"{frame.brightest_dn:.0f}", "X-Mean": f"{frame.mean_dn:.1f}", "X-Full": f"{frame.full:.4f}",
-        }  # fmt: skip
+            "X-Frame": str(frame.number),
+            "X-Age-Ms": str(age_ms),
+            "X-Exposure-Ms": f"{frame.exposure_s * 1000:.3g}",
+            "X-Brightest": f"{frame.brightest_dn:.0f}",
+            "X-Mean": f"{frame.mean_dn:.1f}",
+            "X-Full": f"{frame.full:.4f}",
+        }
         return JpegResponse(frame.jpeg, headers=headers)
 
     return router
@@ -223,7 +227,14 @@ def intact_calibration(stored: StoredCalibration) -> IntactCalibration:
     if off is not None:
         numbers |= {"trial_offset_dpt": off.m_dpt}
     return IntactCalibration(
-        id=calibration.id, serial=made.serial, made_at=made.made_at, made_by=made.made_by, software=made.software,
-        temperature_c=made.temperature_c, simulated=calibration.simulated, numbers=numbers, damaged=None,
+        id=calibration.id,
+        serial=made.serial,
+        made_at=made.made_at,
+        made_by=made.made_by,
+        software=made.software,
+        temperature_c=made.temperature_c,
+        simulated=calibration.simulated,
+        numbers=numbers,
+        damaged=None,
         in_force=False,
-    )  # fmt: skip
+    )

@@ -52,7 +52,7 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
 def _listed(drive: UsbDrive) -> UsbDriveAnswer:
     return UsbDriveAnswer(
         id=drive.id, name=drive.folder.name, free_bytes=drive.free_bytes, is_writable=drive.is_writable
-    )  # fmt: skip
+    )
 
 
 def _copied(store: CaptureStore, repository: VisitRepository, visit: Visit, drive: Path) -> str:

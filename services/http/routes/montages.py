@@ -47,13 +47,23 @@ def montage_answer(one: VisitMontage) -> MontageAnswer:
     """Return the state of a montage and the places of its pictures."""
     placed = one.made.placed if one.made is not None else ()
     return MontageAnswer(
-        state=one.state, digest=one.digest, pictures=len(one.pictures), problem=error_text(one.problem),
+        state=one.state,
+        digest=one.digest,
+        pictures=len(one.pictures),
+        problem=error_text(one.problem),
         projection=None if one.made is None else one.made.projection,
         placed=[
             PlacedPicture(
-                index=at.index, slot=taken.slot, capture=taken.capture, used=at.used, shift_px=at.shift_px,
-                rotation_deg=at.rotation_deg, peak=at.peak, overlap=at.overlap, reason=at.reason,
+                index=at.index,
+                slot=taken.slot,
+                capture=taken.capture,
+                used=at.used,
+                shift_px=at.shift_px,
+                rotation_deg=at.rotation_deg,
+                peak=at.peak,
+                overlap=at.overlap,
+                reason=at.reason,
             )
             for taken, at in zip(one.pictures, placed, strict=False)
         ],
-    )  # fmt: skip
+    )

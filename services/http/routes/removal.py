@@ -13,10 +13,14 @@ def removal_routes(removal: PictureRemoval) -> APIRouter:
     def answer() -> RemovalAnswer:
         now, (captures, size_bytes) = removal.removable(), removal.undoable()
         return RemovalAnswer(
-            visits=now.visits, captures=sum(map(len, now.captures.values())), size_bytes=now.size_bytes,
-            oldest_day=now.oldest_day, newest_day=now.newest_day,
-            undoable_captures=captures, undoable_bytes=size_bytes,
-        )  # fmt: skip
+            visits=now.visits,
+            captures=sum(map(len, now.captures.values())),
+            size_bytes=now.size_bytes,
+            oldest_day=now.oldest_day,
+            newest_day=now.newest_day,
+            undoable_captures=captures,
+            undoable_bytes=size_bytes,
+        )
 
     @router.get("")
     def removable() -> RemovalAnswer:

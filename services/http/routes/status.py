@@ -30,9 +30,12 @@ VERSION = version("diffuscope")
 
 
 def status_router(
-    arbiter: HeadArbiter, repository: VisitRepository, lease: ControlLease, alerts: AlertMonitor,
+    arbiter: HeadArbiter,
+    repository: VisitRepository,
+    lease: ControlLease,
+    alerts: AlertMonitor,
     upload_worker: UploadWorker | None,
-) -> APIRouter:  # fmt: skip
+) -> APIRouter:
     """Return the router of status and health."""
     router = APIRouter()
 
@@ -58,30 +61,40 @@ def status_router(
         collected = collect_status(now, is_dark, context.store, repository, context.clock, unsent)
         checks = run_checks(collected)
         return HealthAnswer(
-            ok=all(check.ok for check in checks), state=collected.state, space_left=collected.captures_left,
+            ok=all(check.ok for check in checks),
+            state=collected.state,
+            space_left=collected.captures_left,
             battery=collected.battery if isinstance(collected.battery, float) else None,
             checks=[CheckAnswer.model_validate(check) for check in checks],
             calibration=[FindingAnswer.model_validate(finding) for finding in arbiter.findings],
-        )  # fmt: skip
+        )
 
     return router
 
 
 def status_answer(
-    arbiter: HeadArbiter, repository: VisitRepository, lease: ControlLease, alerts: AlertMonitor,
+    arbiter: HeadArbiter,
+    repository: VisitRepository,
+    lease: ControlLease,
+    alerts: AlertMonitor,
     upload_worker: UploadWorker | None,
-) -> StatusAnswer:  # fmt: skip
+) -> StatusAnswer:
     """Return the status of the instrument."""
     spec, head, problem, store = arbiter.context.spec, arbiter.head, arbiter.problem, arbiter.context.store
     radius_px = field_radius_px(head.calibration) if head is not None else float("inf")
     return StatusAnswer(
-        name=spec.name, kind=kind_of(spec), state=arbiter.state,
+        name=spec.name,
+        kind=kind_of(spec),
+        state=arbiter.state,
         shape=head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
-        field_px=2 * radius_px if radius_px < float("inf") else None, version=VERSION,
+        field_px=2 * radius_px if radius_px < float("inf") else None,
+        version=VERSION,
         swept=[InterruptedCaptureAnswer.model_validate(one) for one in interrupted_captures(arbiter, repository)],
-        space_left=store.space.captures_left(), people_left=store.space.visits_left(len(repository.protocol.slots)),
-        controller=lease.holder, problem=problem_body(problem) if problem else None,
+        space_left=store.space.captures_left(),
+        people_left=store.space.visits_left(len(repository.protocol.slots)),
+        controller=lease.holder,
+        problem=problem_body(problem) if problem else None,
         standing=[AlertAnswer.model_validate(alert) for alert in alerts.active_alerts()],
         sending=UploadCountsAnswer.model_validate(upload_worker.counts()) if upload_worker is not None else None,
         notices=[one.remedy for one in arbiter.findings if not one.ok and not is_age_warning(one)],
-    )  # fmt: skip
+    )

@@ -27,9 +27,11 @@ def _pin_router(authenticator: PinAuthenticator) -> APIRouter:
     def login_state(token: Token = None) -> LoginState:
         """Return whether this client is logged in and a PIN is set, the lock-out left and the idle timeout, seconds."""
         return LoginState(
-            open=authenticator.is_logged_in(token), has_pin=authenticator.has_pin,
-            wait_s=round(authenticator.lock_out_s, 1), idle_s=IDLE_TIMEOUT_S,
-        )  # fmt: skip
+            open=authenticator.is_logged_in(token),
+            has_pin=authenticator.has_pin,
+            wait_s=round(authenticator.lock_out_s, 1),
+            idle_s=IDLE_TIMEOUT_S,
+        )
 
     @router.post("/pin")
     def set_pin(pin: Pin, response: Response, token: Token = None) -> LoginAnswer:

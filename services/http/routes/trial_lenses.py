@@ -23,21 +23,33 @@ def trial_lens_answer(owner: HeadOwner) -> TrialLensAnswer | None:
     bench, now = owner.session.bench, owner.session.snapshot()
     current = now.lens if now.state != "begin" else None
     return TrialLensAnswer(
-        state=now.state, lens=current, vertex_mm=bench.vertex_mm, eye_dpt=bench.eye.m_dpt,
-        rows=_rows(bench, now.readings, current), findings=[], offset=None, error=error_text(now.error),
-        stored_id=None, ended_at=None,
-    )  # fmt: skip
+        state=now.state,
+        lens=current,
+        vertex_mm=bench.vertex_mm,
+        eye_dpt=bench.eye.m_dpt,
+        rows=_rows(bench, now.readings, current),
+        findings=[],
+        offset=None,
+        error=error_text(now.error),
+        stored_id=None,
+        ended_at=None,
+    )
 
 
 def _finished(run: TrialLensOutcome) -> TrialLensAnswer:
     fit, stored = run.fit, run.stored
     return TrialLensAnswer(
-        state="done", lens=None, vertex_mm=run.bench.vertex_mm, eye_dpt=run.bench.eye.m_dpt,
+        state="done",
+        lens=None,
+        vertex_mm=run.bench.vertex_mm,
+        eye_dpt=run.bench.eye.m_dpt,
         rows=_rows(run.bench, run.readings, None, () if fit is None else fit.residuals_dpt),
         findings=[] if fit is None else [FindingAnswer.model_validate(one) for one in fit.findings],
-        offset=None if fit is None else LensPower.model_validate(fit.offset), error=error_text(run.failure),
-        stored_id=None if stored is None else stored.calibration.id, ended_at=run.ended_at,
-    )  # fmt: skip
+        offset=None if fit is None else LensPower.model_validate(fit.offset),
+        error=error_text(run.failure),
+        stored_id=None if stored is None else stored.calibration.id,
+        ended_at=run.ended_at,
+    )
 
 
 def _rows(
@@ -50,11 +62,14 @@ def _rows(
         state: Literal["todo", "now", "done"] = "done" if reading else "now" if number == current else "todo"
         nominal = correction_behind(lens, bench.vertex_mm, bench.eye)
         row = TrialLensRow(
-            sphere_dpt=lens.sphere_dpt, cylinder_dpt=lens.cylinder_dpt, axis_deg=lens.axis_deg, state=state,
+            sphere_dpt=lens.sphere_dpt,
+            cylinder_dpt=lens.cylinder_dpt,
+            axis_deg=lens.axis_deg,
+            state=state,
             nominal=LensPower.model_validate(nominal),
             measured=None if reading is None else LensPower.model_validate(reading.found),
             sd=None if reading is None else LensPower.model_validate(reading.sds),
             off_line_dpt=off_line_dpt[number] if off_line_dpt else None,
-        )  # fmt: skip
+        )
         rows.append(row)
     return rows

@@ -53,6 +53,12 @@ def _waiting_visit(one: QueuedVisit) -> WaitingVisit:
     if one.error:
         error = ErrorText(code=one.error, message=one.message or "", remedy=REMEDIES.get(one.error, ""))
     return WaitingVisit(
-        visit=one.visit, number=one.number, since=one.finished_at, size_bytes=one.size_bytes, tries=one.tries,
-        failing_since=one.failing_since, error=error, stuck=one.stuck,
-    )  # fmt: skip
+        visit=one.visit,
+        number=one.number,
+        since=one.finished_at,
+        size_bytes=one.size_bytes,
+        tries=one.tries,
+        failing_since=one.failing_since,
+        error=error,
+        stuck=one.stuck,
+    )

@@ -193,18 +193,26 @@ def visit_answer(visit: Visit, repository: VisitRepository) -> VisitAnswer:
     ending = visit.outcome
     with reading_record(visit.id):
         return VisitAnswer(
-            id=visit.id, number=visit.number, begun_at=visit.begun_at, day=visit.day, fields=dict(visit.fields),
-            slots={id: _slot_answer(slot) for id, slot in visit.slots.items()}, next_slot=visit.next_slot,
+            id=visit.id,
+            number=visit.number,
+            begun_at=visit.begun_at,
+            day=visit.day,
+            fields=dict(visit.fields),
+            slots={id: _slot_answer(slot) for id, slot in visit.slots.items()},
+            next_slot=visit.next_slot,
             outcome=OutcomeAnswer(code=ending.code, sentence=ending.sentence) if ending else None,
             finished_at=visit.finished_at,
             undo_until=repository.undo_until(visit),
-        )  # fmt: skip
+        )
 
 
 def _slot_answer(slot: SlotState) -> SlotAnswer:
     chosen = slot.chosen
     return SlotAnswer(
-        state=slot.state, capture=chosen.capture if chosen else None, captures=[one.capture for one in slot.captures],
+        state=slot.state,
+        capture=chosen.capture if chosen else None,
+        captures=[one.capture for one in slot.captures],
         verdict=verdict_answer(chosen.verdict) if chosen else None,
-        reason=slot.decision.reason if slot.decision else None, tries=len(slot.captures),
-    )  # fmt: skip
+        reason=slot.decision.reason if slot.decision else None,
+        tries=len(slot.captures),
+    )

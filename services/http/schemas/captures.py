@@ -223,24 +223,41 @@ def capture_answer(capture: Capture) -> CaptureAnswer:
     """Return a capture with its report, its verdict and the URLs of its files."""
     at, report = f"/api/captures/{capture.id}", capture.report
     links = CaptureLinks(
-        picture=f"{at}/picture.png", colour=f"{at}/{COLOUR}" if COLOUR in capture.files else None,
-        raw=f"{at}/raw.tiff", report=f"{at}/report.json", quick=f"{at}/quick.jpg",
-    )  # fmt: skip
+        picture=f"{at}/picture.png",
+        colour=f"{at}/{COLOUR}" if COLOUR in capture.files else None,
+        raw=f"{at}/raw.tiff",
+        report=f"{at}/report.json",
+        quick=f"{at}/quick.jpg",
+    )
     return CaptureAnswer(
-        id=capture.id, eye=capture.eye, taken_at=capture.taken_at, simulated=capture.simulated,
-        calibration_id=capture.calibration_id, report=report_answer(report), visit=report.visit, slot=report.slot,
-        test=report.is_test, verdict=verdict_answer(report.verdict), files=capture.files, links=links,
+        id=capture.id,
+        eye=capture.eye,
+        taken_at=capture.taken_at,
+        simulated=capture.simulated,
+        calibration_id=capture.calibration_id,
+        report=report_answer(report),
+        visit=report.visit,
+        slot=report.slot,
+        test=report.is_test,
+        verdict=verdict_answer(report.verdict),
+        files=capture.files,
+        links=links,
         versions=[_version(one, capture.files, at) for one in report.versions] or None,
-    )  # fmt: skip
+    )
 
 
 def _version(one: CaptureVersion, files: Mapping[str, str], at: str) -> VersionAnswer:
     """Return a version of a capture whose files are below the URL `at`."""
     return VersionAnswer(
-        number=one.number, result=one.result, at=one.at, method=one.method, software=one.software,
-        picture=f"{at}/{one.picture}", colour=f"{at}/{one.colour}" if one.colour in files else None,
+        number=one.number,
+        result=one.result,
+        at=one.at,
+        method=one.method,
+        software=one.software,
+        picture=f"{at}/{one.picture}",
+        colour=f"{at}/{one.colour}" if one.colour in files else None,
         report=f"{at}/{one.report}",
-    )  # fmt: skip
+    )
 
 
 def report_answer(report: CaptureReport) -> ReportAnswer:
@@ -249,15 +266,20 @@ def report_answer(report: CaptureReport) -> ReportAnswer:
     A stored entry whose type this release does not know has its default; other unknown entries are passed on.
     """
     entries = {
-        **vars(report.reconstruction), **vars(report.light), "visit": report.visit, "slot": report.slot,
-        "test": report.is_test, "budget_s": report.budget_s, "verdict": verdict_answer(report.verdict),
+        **vars(report.reconstruction),
+        **vars(report.light),
+        "visit": report.visit,
+        "slot": report.slot,
+        "test": report.is_test,
+        "budget_s": report.budget_s,
+        "verdict": verdict_answer(report.verdict),
         "limits_unchecked": list(report.light.limits_unchecked) or None,
         "frames": [FrameAnswer.model_validate(vars(one)) for one in report.reconstruction.frames] or None,
         "channels": [ChannelAnswer.model_validate(vars(one)) for one in report.reconstruction.channels] or None,
         "laterality": _stored(LateralityAnswer, report.laterality) if report.laterality else None,
         "moved": [_stored(EyeCorrectionAnswer, one) for one in report.moved] or None,
         "confirmed": _stored(EyeConfirmationAnswer, report.confirmed) if report.confirmed else None,
-    }  # fmt: skip
+    }
     return ReportAnswer.model_validate(_unknown(ReportAnswer, report.others) | entries)
 
 

@@ -157,8 +157,16 @@ class CalibrationEvent(ResponseBody):
 
 
 ServerSentEvent = Annotated[
-    HeartbeatEvent | StateEvent | AimEvent | StageEvent | VerdictEvent | KeptEvent | FailedEvent | ExplorerEvent
-    | NoticeEvent | CalibrationEvent,
+    HeartbeatEvent
+    | StateEvent
+    | AimEvent
+    | StageEvent
+    | VerdictEvent
+    | KeptEvent
+    | FailedEvent
+    | ExplorerEvent
+    | NoticeEvent
+    | CalibrationEvent,
     Field(discriminator="event"),
-]  # fmt: skip
+]
 SERVER_SENT_EVENT: TypeAdapter[ServerSentEvent] = TypeAdapter(ServerSentEvent)

@@ -119,12 +119,18 @@ def _adopt(
     at = clock.wall()
     store.versions.adopt(
         NewVersion(
-            capture=capture.id, result=planned.result, frames=_frames(planned), device=planned.origin,
-            method=stored.method, software=f"{software['diffuscope']} ({software['code']})",
-            picture=to_png(picture, stored.simulated, note), report=_report(stored, capture), colour=coloured,
+            capture=capture.id,
+            result=planned.result,
+            frames=_frames(planned),
+            device=planned.origin,
+            method=stored.method,
+            software=f"{software['diffuscope']} ({software['code']})",
+            picture=to_png(picture, stored.simulated, note),
+            report=_report(stored, capture),
+            colour=coloured,
         ),
         at,
-    )  # fmt: skip
+    )
 
 
 def _shown(picture: Image, field_px: tuple[int, int, int, int]) -> Image:

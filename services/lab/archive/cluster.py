@@ -37,15 +37,17 @@ RESUME = "Run the same command again: it resumes."
 LOST = (CommClosedError, ClosedClientError, FutureCancelledError, TimeoutError)
 _LOCK = Lock()  # a worker with several threads: the solvers are for one thread at a time
 
-dask.config.set({
-    "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
-    "distributed.scheduler.worker-ttl": "5 minutes",
-    "distributed.admin.system-monitor.gil.enabled": False,
-    "distributed.worker.profile.enabled": False,
-    # Without Dask's MALLOC_TRIM_THRESHOLD_=65536: it unmaps every large array at its end, which doubled the time of a
-    # capture (0.23 to 0.44 s, 270 x 480 pixels) by page faults.
-    "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
-})  # fmt: skip
+dask.config.set(
+    {
+        "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
+        "distributed.scheduler.worker-ttl": "5 minutes",
+        "distributed.admin.system-monitor.gil.enabled": False,
+        "distributed.worker.profile.enabled": False,
+        # Without Dask's MALLOC_TRIM_THRESHOLD_=65536: it unmaps every large array at its end, which doubled the time of
+        # a capture (0.23 to 0.44 s, 270 x 480 pixels) by page faults.
+        "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
+    }
+)
 
 
 @contextmanager

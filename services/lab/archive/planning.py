@@ -30,9 +30,7 @@ from services.lab.reconstruct_inputs import ReconstructOptions
 STEP = 500  # captures between two lines of progress
 
 
-def make_plan(
-    sources: Sequence[Path], settings: PlanSettings, clock: Clock, progress: Callable[[str], None]
-) -> Plan:  # fmt: skip
+def make_plan(sources: Sequence[Path], settings: PlanSettings, clock: Clock, progress: Callable[[str], None]) -> Plan:
     """Return the plan for all captures of the sources; nothing is written.
 
     A capture that cannot be planned is in `left_out` with its reason: no raw frame or an empty one, no calibration, or
@@ -52,10 +50,14 @@ def make_plan(
             if planning.count % STEP == 0:
                 progress(f"{planning.count} captures found")
     return Plan(
-        made_at=clock.wall().isoformat(timespec="seconds"), sources=tuple(map(str, places)), settings=settings,
-        software=software(), calibrations=tuple(planning.calibrations.values()),
-        captures=tuple(planning.captures.values()), left_out=tuple(planning.left_out),
-    )  # fmt: skip
+        made_at=clock.wall().isoformat(timespec="seconds"),
+        sources=tuple(map(str, places)),
+        settings=settings,
+        software=software(),
+        calibrations=tuple(planning.calibrations.values()),
+        captures=tuple(planning.captures.values()),
+        left_out=tuple(planning.left_out),
+    )
 
 
 class _Planning:
@@ -100,11 +102,23 @@ class _Planning:
             self._leave_out(found, source, f"it has the same content as {same.id}")
             return
         self.captures[name] = PlannedCapture(
-            id=found.id, source=str(source), raw=str(found.raw), raw_sha256=raw_digest, result=name,
-            calibration=calibration.digest, frames=frames, dark=_text(found.dark), dark_sha256=dark_digest,
-            truth=_text(found.truth), before=_text(found.before), report=_text(found.report),
-            device=found.device, origin=found.origin, eye=found.eye, taken_at=found.taken_at,
-        )  # fmt: skip
+            id=found.id,
+            source=str(source),
+            raw=str(found.raw),
+            raw_sha256=raw_digest,
+            result=name,
+            calibration=calibration.digest,
+            frames=frames,
+            dark=_text(found.dark),
+            dark_sha256=dark_digest,
+            truth=_text(found.truth),
+            before=_text(found.before),
+            report=_text(found.report),
+            device=found.device,
+            origin=found.origin,
+            eye=found.eye,
+            taken_at=found.taken_at,
+        )
 
     def _calibration(self, found: FoundCalibration) -> PlannedCalibration:
         """Return the planned calibration of these files; each file is read once."""
@@ -143,7 +157,17 @@ def _refuse_settings(settings: PlanSettings) -> None:
         raise SettingError("rounds and seconds limit the same", "Give --rounds or --budget-s, not both.")
     refuse_invalid(
         ReconstructOptions(
-            Path(), (Path(),), None, settings.method, settings.budget_s, None, None, None, None, False, None,
+            Path(),
+            (Path(),),
+            None,
+            settings.method,
+            settings.budget_s,
+            None,
+            None,
+            None,
+            None,
+            False,
+            None,
             rounds=settings.rounds,
         )
-    )  # fmt: skip
+    )

@@ -117,14 +117,17 @@ def html(folder: Path, columns: Columns, found: list[Change]) -> str:
     simulated = any(value is True for value in columns.values("simulated"))
     mark = "<b>Pictures of simulated frames carry a mark.</b>" if simulated else ""
     parts = [
-        _section("What was done", _summary(folder, columns)), _section("Quality before and after", _quality(found)),
+        _section("What was done", _summary(folder, columns)),
+        _section("Quality before and after", _quality(found)),
         _section("Largest improvements", _pictures(folder, columns, _best(found))),
         _section("Largest losses", _losses(folder, columns, found)),
-        _section("Frames and colours", _frames(columns)), _section("Messages and quarantine", _causes(columns)),
+        _section("Frames and colours", _frames(columns)),
+        _section("Messages and quarantine", _causes(columns)),
         _section("PSF consistency", _drift(columns)),
-        _section("Retakes", _retakes(columns)), _section("Refraction", _refraction(columns)),
+        _section("Retakes", _retakes(columns)),
+        _section("Refraction", _refraction(columns)),
         _section("Cost", _cost(columns)),
-    ]  # fmt: skip
+    ]
     head = '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     style = f"<style>{STYLE} img {{ max-width: 100%; }} .pair {{ display: flex; gap: 8px; }}</style>"
     title = "Reprocessed archive"
@@ -285,9 +288,11 @@ def _causes(columns: Columns) -> str:
 
 def _drift(columns: Columns) -> str:
     """Return PSF consistency by device, and against the age of the calibration."""
-    scores, ages, devices = columns.numbers("quality_psf_score"), columns.numbers("calibration_age_days"), (
-        columns.words("device")
-    )  # fmt: skip
+    scores, ages, devices = (
+        columns.numbers("quality_psf_score"),
+        columns.numbers("calibration_age_days"),
+        (columns.words("device")),
+    )
     by_device: dict[str, list[float]] = defaultdict(list)
     points = []
     for score, age, device in zip(scores, ages, devices, strict=True):
@@ -333,8 +338,10 @@ def _cost(columns: Columns) -> str:
     workers = Counter(word for word in columns.words("worker") if word)
     hours = sum(totals) / 3600
     rows = [
-        ["time of all tasks", f"{hours:.3g} h"], ["median of a capture", f"{median(totals):.2f} s"],
-        ["of which the solver", f"{median(solving):.2f} s"], ["longest", f"{max(totals):.2f} s"],
+        ["time of all tasks", f"{hours:.3g} h"],
+        ["median of a capture", f"{median(totals):.2f} s"],
+        ["of which the solver", f"{median(solving):.2f} s"],
+        ["longest", f"{max(totals):.2f} s"],
         ["workers", str(len(workers))],
-    ]  # fmt: skip
+    ]
     return _table(("cost", ""), rows)

@@ -30,9 +30,13 @@ class Ran:
 
 
 def run_plan(
-    plan: Plan, root: Path, clock: Clock, progress: Callable[[str], None], workers: int | None = None,
+    plan: Plan,
+    root: Path,
+    clock: Clock,
+    progress: Callable[[str], None],
+    workers: int | None = None,
     scheduler: str | None = None,
-) -> Ran:  # fmt: skip
+) -> Ran:
     """Compute every capture without a result, except those in quarantine that cannot succeed; write the table.
 
     Idempotent. `workers` and `scheduler` as of `cluster.connected`. `progress` gets lines of text. SettingError for a
@@ -55,9 +59,13 @@ def run_plan(
 
 
 def _run(
-    plan: Plan, results: ResultFolder, clock: Clock, progress: Callable[[str], None], workers: int | None,
+    plan: Plan,
+    results: ResultFolder,
+    clock: Clock,
+    progress: Callable[[str], None],
+    workers: int | None,
     scheduler: str | None,
-) -> Ran:  # fmt: skip
+) -> Ran:
     kept = {one.name for one in results.quarantined() if not one.retry}
     captures = sorted(plan.captures, key=lambda one: one.calibration)
     names = [one.result for one in captures if one.result not in kept and not results.has(one.result)]

@@ -83,12 +83,20 @@ class CalibrationFiles:
         """Return the options of a reconstruction with the local copies of a calibration."""
         place = self._root / calibration.digest
         return ReconstructOptions(
-            raw=Path(), psfs=self.paths(calibration, "psf"), output=None, method=settings.method,
-            budget_s=settings.budget_s, dark=next(iter(self.paths(calibration, "dark")), None),
-            flat=next(iter(self.paths(calibration, "flat")), None), head=None, field_deg=None,
-            even=False, plans=None, rounds=settings.rounds,
+            raw=Path(),
+            psfs=self.paths(calibration, "psf"),
+            output=None,
+            method=settings.method,
+            budget_s=settings.budget_s,
+            dark=next(iter(self.paths(calibration, "dark")), None),
+            flat=next(iter(self.paths(calibration, "flat")), None),
+            head=None,
+            field_deg=None,
+            even=False,
+            plans=None,
+            rounds=settings.rounds,
             calibration=f"{place}:{calibration.id}" if calibration.id else None,
-        )  # fmt: skip
+        )
 
     def paths(self, calibration: PlannedCalibration, role: Role) -> tuple[Path, ...]:
         """Return the local copies of the files of a calibration with this role."""
@@ -129,8 +137,12 @@ class Solvers:
         if isinstance(made, Quarantined):
             return Outcome(name, self._clock.now_s() - begin_s, made)
         total_s = self._clock.now_s() - begin_s
-        run = {"seconds": made.solved.made.report.seconds, "total_s": total_s, "worker": worker,
-               "finished_at": self._clock.wall().isoformat(timespec="seconds")}  # fmt: skip
+        run = {
+            "seconds": made.solved.made.report.seconds,
+            "total_s": total_s,
+            "worker": worker,
+            "finished_at": self._clock.wall().isoformat(timespec="seconds"),
+        }
         simulated = made.solved.made.simulated
         files = {
             PICTURE: tiff_bytes(made.solved.made.picture, simulated),
@@ -253,8 +265,15 @@ def _report(task: Task, made: _Made) -> dict[str, object]:
     rows, cols = solved.made.picture.shape[:2]
     (top, bottom, _), (left, right, _) = (one.indices(n) for one, n in zip(solved.box, (rows, cols), strict=True))
     return {
-        "capture": task.capture.model_dump(), "calibration": task.calibration.model_dump(),
-        "settings": task.settings.model_dump(), "software": task.software, "report": report, "raw": made.facts,
-        "scores": made.scores, "rows": rows, "cols": cols, "simulated": solved.made.simulated,
+        "capture": task.capture.model_dump(),
+        "calibration": task.calibration.model_dump(),
+        "settings": task.settings.model_dump(),
+        "software": task.software,
+        "report": report,
+        "raw": made.facts,
+        "scores": made.scores,
+        "rows": rows,
+        "cols": cols,
+        "simulated": solved.made.simulated,
         "field_px": [top, bottom, left, right],
-    }  # fmt: skip
+    }

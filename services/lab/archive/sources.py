@@ -134,9 +134,7 @@ def _refusal(folder: Path) -> str | None:
     return None
 
 
-def _stored(
-    store: Path, place: Path, calibrations: Mapping[str, Path], unusable: Mapping[str, str]
-) -> FoundCapture:  # fmt: skip
+def _stored(store: Path, place: Path, calibrations: Mapping[str, Path], unusable: Mapping[str, str]) -> FoundCapture:
     """Return one capture of a store; refused without a record, a raw frame or a calibration."""
     from services.errors import StoreDamaged
     from services.records.capture_report import read_report
@@ -156,13 +154,18 @@ def _stored(
         return replace(found, refused=f"its report cannot be read: {error}")
     id = str(content.get("calibration_id"))
     found = replace(
-        found, raw_sha256=digests.get("raw.tiff"), dark_sha256=digests.get("dark.tiff"),
-        dark=place / "dark.tiff" if "dark.tiff" in digests else None, report=place / "report.json",
-        frames=_stored_frames(place, digests, report), before=place / "picture.png",
-        eye=str(content.get("eye", "")), taken_at=str(content.get("taken_at", "")),
+        found,
+        raw_sha256=digests.get("raw.tiff"),
+        dark_sha256=digests.get("dark.tiff"),
+        dark=place / "dark.tiff" if "dark.tiff" in digests else None,
+        report=place / "report.json",
+        frames=_stored_frames(place, digests, report),
+        before=place / "picture.png",
+        eye=str(content.get("eye", "")),
+        taken_at=str(content.get("taken_at", "")),
         device=calibrations[id].parent.name if id in calibrations else "",
         origin=(report.device and report.device.uuid) or "",
-    )  # fmt: skip
+    )
     if gone := [path.name for path in (found.raw, *(one.path for one in found.frames)) if not path.is_file()]:
         return replace(found, refused=f"its raw frame {gone[0]} was removed")
     if id not in calibrations:

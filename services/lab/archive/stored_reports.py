@@ -18,9 +18,13 @@ def earlier_figures(path: str) -> dict[str, object]:
     parts = {key: report.get(key) for key in ("quality", "refraction_dpt", "verdict", "seconds")}
     quality, dpt, verdict, seconds = (one if isinstance(one, dict) else {} for one in parts.values())
     return {
-        "before_method": report.get("method"), "before_residual": report.get("residual"),
-        "before_cutoff_per_px": quality.get("cutoff_per_px"), "before_structure_sure": quality.get("structure_sure"),
-        "before_sphere_dpt": dpt.get("sphere"), "before_verdict": verdict.get("word"),
-        "before_cause": verdict.get("code"), "dose_j_per_cm2": report.get("dose_j_per_cm2"),
+        "before_method": report.get("method"),
+        "before_residual": report.get("residual"),
+        "before_cutoff_per_px": quality.get("cutoff_per_px"),
+        "before_structure_sure": quality.get("structure_sure"),
+        "before_sphere_dpt": dpt.get("sphere"),
+        "before_verdict": verdict.get("word"),
+        "before_cause": verdict.get("code"),
+        "dose_j_per_cm2": report.get("dose_j_per_cm2"),
         "before_seconds": sum(one for one in seconds.values() if isinstance(one, float)) or None,
-    }  # fmt: skip
+    }

@@ -22,27 +22,90 @@ from services.lab.archive.stored_reports import earlier_figures
 
 ROWS_PER_GROUP = 5_000
 QUALITY = (
-    "saturated", "missing", "mean_dn", "structure_nats", "structure_sure", "through", "coverage", "cutoff_per_px",
-    "resolution_um", "psf_score", "psf_score_sd", "psf_orientation", "psf_mirrored",
-)  # fmt: skip
+    "saturated",
+    "missing",
+    "mean_dn",
+    "structure_nats",
+    "structure_sure",
+    "through",
+    "coverage",
+    "cutoff_per_px",
+    "resolution_um",
+    "psf_score",
+    "psf_score_sd",
+    "psf_orientation",
+    "psf_mirrored",
+)
 TEXT, NUMBER, COUNT, FLAG, TEXTS = pa.string(), pa.float64(), pa.int64(), pa.bool_(), pa.list_(pa.string())
 BEFORE = {
-    "before_picture": TEXT, "before_method": TEXT, "before_residual": NUMBER, "before_cutoff_per_px": NUMBER,
-    "before_structure_sure": NUMBER, "before_sphere_dpt": NUMBER, "before_verdict": TEXT, "before_cause": TEXT,
-    "dose_j_per_cm2": NUMBER, "before_seconds": NUMBER,
-}  # fmt: skip
-SCHEMA = pa.schema({
-    "id": TEXT, "state": TEXT, "reason": TEXT, "reason_code": TEXT, "source": TEXT, "raw": TEXT, "raw_sha256": TEXT,
-    "result": TEXT, "picture": TEXT, "colour_picture": TEXT, "device": TEXT, "eye": TEXT, "taken_at": TEXT,
-    "calibration": TEXT, "calibration_made_at": TEXT, "calibration_age_days": NUMBER, "simulated": FLAG, "rows": COUNT,
-    "cols": COUNT, "exposure_s": NUMBER, "light_colour": TEXT, "light_level": NUMBER, "frames": COUNT,
-    "frames_used": COUNT, "channels": TEXTS, "predicted_channels": TEXTS, "missing_channels": TEXTS, "method": TEXT,
-    "bin": COUNT, "rounds": COUNT, "stopped": TEXT, "psf_index": COUNT, "psf_scale": NUMBER, "noise_dn": NUMBER,
-    "residual": NUMBER, **{f"quality_{name}": NUMBER for name in QUALITY}, "sphere_dpt": NUMBER,
-    "sphere_sd_dpt": NUMBER, "j0_dpt": NUMBER, "j45_dpt": NUMBER, "messages": TEXTS, "psnr_db": NUMBER, "pcc": NUMBER,
-    "before_psnr_db": NUMBER, "before_pcc": NUMBER, **BEFORE, "solve_s": NUMBER, "total_s": NUMBER, "worker": TEXT,
-    "finished_at": TEXT, "diffuscope": TEXT, "software": TEXT, "settings": TEXT,
-})  # fmt: skip
+    "before_picture": TEXT,
+    "before_method": TEXT,
+    "before_residual": NUMBER,
+    "before_cutoff_per_px": NUMBER,
+    "before_structure_sure": NUMBER,
+    "before_sphere_dpt": NUMBER,
+    "before_verdict": TEXT,
+    "before_cause": TEXT,
+    "dose_j_per_cm2": NUMBER,
+    "before_seconds": NUMBER,
+}
+SCHEMA = pa.schema(
+    {
+        "id": TEXT,
+        "state": TEXT,
+        "reason": TEXT,
+        "reason_code": TEXT,
+        "source": TEXT,
+        "raw": TEXT,
+        "raw_sha256": TEXT,
+        "result": TEXT,
+        "picture": TEXT,
+        "colour_picture": TEXT,
+        "device": TEXT,
+        "eye": TEXT,
+        "taken_at": TEXT,
+        "calibration": TEXT,
+        "calibration_made_at": TEXT,
+        "calibration_age_days": NUMBER,
+        "simulated": FLAG,
+        "rows": COUNT,
+        "cols": COUNT,
+        "exposure_s": NUMBER,
+        "light_colour": TEXT,
+        "light_level": NUMBER,
+        "frames": COUNT,
+        "frames_used": COUNT,
+        "channels": TEXTS,
+        "predicted_channels": TEXTS,
+        "missing_channels": TEXTS,
+        "method": TEXT,
+        "bin": COUNT,
+        "rounds": COUNT,
+        "stopped": TEXT,
+        "psf_index": COUNT,
+        "psf_scale": NUMBER,
+        "noise_dn": NUMBER,
+        "residual": NUMBER,
+        **{f"quality_{name}": NUMBER for name in QUALITY},
+        "sphere_dpt": NUMBER,
+        "sphere_sd_dpt": NUMBER,
+        "j0_dpt": NUMBER,
+        "j45_dpt": NUMBER,
+        "messages": TEXTS,
+        "psnr_db": NUMBER,
+        "pcc": NUMBER,
+        "before_psnr_db": NUMBER,
+        "before_pcc": NUMBER,
+        **BEFORE,
+        "solve_s": NUMBER,
+        "total_s": NUMBER,
+        "worker": TEXT,
+        "finished_at": TEXT,
+        "diffuscope": TEXT,
+        "software": TEXT,
+        "settings": TEXT,
+    }
+)
 Row = dict[str, object]
 
 
@@ -111,17 +174,29 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     place = results.place(name)
     colour = place / COLOUR_PICTURE
     return {
-        "state": "done", "picture": str((place / PICTURE).relative_to(results.root)),
+        "state": "done",
+        "picture": str((place / PICTURE).relative_to(results.root)),
         "colour_picture": str(colour.relative_to(results.root)) if colour.is_file() else None,
         **_frame_columns(report),
-        "simulated": document.get("simulated"), "rows": document.get("rows"), "cols": document.get("cols"),
-        "exposure_s": raw.get("exposure_s"), "light_colour": raw.get("colour"), "light_level": raw.get("light_level"),
-        **{key: report.get(key) for key in same}, **{f"quality_{key}": quality.get(key) for key in QUALITY},
-        "sphere_dpt": dpt.get("sphere"), "sphere_sd_dpt": dpt.get("sd"), "j0_dpt": dpt.get("j0"),
-        "j45_dpt": dpt.get("j45"), "messages": report.get("warnings"), **scores,
-        "solve_s": seconds.get("solve"), "total_s": run.get("total_s"), "worker": run.get("worker"),
+        "simulated": document.get("simulated"),
+        "rows": document.get("rows"),
+        "cols": document.get("cols"),
+        "exposure_s": raw.get("exposure_s"),
+        "light_colour": raw.get("colour"),
+        "light_level": raw.get("light_level"),
+        **{key: report.get(key) for key in same},
+        **{f"quality_{key}": quality.get(key) for key in QUALITY},
+        "sphere_dpt": dpt.get("sphere"),
+        "sphere_sd_dpt": dpt.get("sd"),
+        "j0_dpt": dpt.get("j0"),
+        "j45_dpt": dpt.get("j45"),
+        "messages": report.get("warnings"),
+        **scores,
+        "solve_s": seconds.get("solve"),
+        "total_s": run.get("total_s"),
+        "worker": run.get("worker"),
         "finished_at": run.get("finished_at"),
-    }  # fmt: skip
+    }
 
 
 def _frame_columns(report: Mapping[str, object]) -> Row:
@@ -129,11 +204,12 @@ def _frame_columns(report: Mapping[str, object]) -> Row:
     frames, channels = _objects(report.get("frames")), _objects(report.get("channels"))
     taken = [one for one in channels if one.get("reason") is None]
     return {
-        "frames": len(frames), "frames_used": sum(one.get("used") is True for one in frames),
+        "frames": len(frames),
+        "frames_used": sum(one.get("used") is True for one in frames),
         "channels": [one.get("name") for one in taken if not one.get("predicted")],
         "predicted_channels": [one.get("name") for one in taken if one.get("predicted")],
         "missing_channels": [one.get("name") for one in channels if one.get("reason") is not None],
-    }  # fmt: skip
+    }
 
 
 def _object(value: Any) -> Mapping[str, object]:

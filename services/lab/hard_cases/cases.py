@@ -187,24 +187,29 @@ CASES: tuple[Case, ...] = (
         _case(f"{share:.1%} saturated", "too bright", saturated(share), "bright pixels", MISSING)
         for share in (0.001, 0.01, 0.04, 0.1)
     ),
-    _case("glare, 0.3 % clipped", "too bright",
-          lambda eye: eye.clean.with_raw(defects.glare(eye.clean.raw, eye.spec.camera, 0.003)), "bright pixels",
-          MISSING),
+    _case(
+        "glare, 0.3 % clipped",
+        "too bright",
+        lambda eye: eye.clean.with_raw(defects.glare(eye.clean.raw, eye.spec.camera, 0.003)),
+        "bright pixels",
+        MISSING,
+    ),
     *(
         _case(f"{name}, {kind}", "dead pixels", build(where), "pixels", MISSING)
-        for name, where in (("dead columns", defects.dead_columns), ("dead rows", defects.dead_rows),
-                            ("dead blob", defects.blob))
+        for name, where in (
+            ("dead columns", defects.dead_columns),
+            ("dead rows", defects.dead_rows),
+            ("dead blob", defects.blob),
+        )
         for kind, build in (("declared", declared), ("0 DN", undeclared))
     ),
     *(
-        _case(f"warm, {share:.2%} + {more_dn} DN", "unknown warm pixels", warm(share, more_dn / 4095), "pixels",
-              MISSING)
+        _case(
+            f"warm, {share:.2%} + {more_dn} DN", "unknown warm pixels", warm(share, more_dn / 4095), "pixels", MISSING
+        )
         for share, more_dn in ((0.0001, 1500), (0.001, 1500), (0.01, 300))
     ),
-    *(
-        _case(f"{peak_e} e- peak", "little light", peak(peak_e), "", DIM)
-        for peak_e in (50, 100, 250, 500)
-    ),
+    *(_case(f"{peak_e} e- peak", "little light", peak(peak_e), "", DIM) for peak_e in (50, 100, 250, 500)),
     *(
         _case(f"eye off by {more_dpt:+g} dpt", "wrong PSF", of_eye(more_dpt), "", OTHER_EYE)
         for more_dpt in (0.5, -1, 2, -4)
@@ -213,25 +218,28 @@ CASES: tuple[Case, ...] = (
     _case("PSF of another head", "wrong PSF", foreign_psf, "psf", NO_TEST),
     _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf", NO_TEST),
     _case("rim cut", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(5.0, 16.7)), "lit", CUT),
-    _case("half a lid", "parts of the field",
-          lambda eye: eye.frame({"sim.light.stray": 0.5}, above_dark(0.0)), "lit eye misfit", PEDESTAL),
-    *(
-        _case(f"stray light {share:.0%}", "light", stray(share), "eye bright", PEDESTAL)
-        for share in (0.2, 1.0)
+    _case(
+        "half a lid",
+        "parts of the field",
+        lambda eye: eye.frame({"sim.light.stray": 0.5}, above_dark(0.0)),
+        "lit eye misfit",
+        PEDESTAL,
     ),
-    *(
-        _case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED)
-        for deg in (0.5, 1.5)
-    ),
+    *(_case(f"stray light {share:.0%}", "light", stray(share), "eye bright", PEDESTAL) for share in (0.2, 1.0)),
+    *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),
     _case("constant", "what is no frame", constant, "eye signal misfit", EVEN),
-    _case("8 bit", "wrong counts",
-          lambda eye: eye.clean.with_raw(defects.eight_bits(eye.clean.raw, eye.spec.camera)), "counts"),
+    _case(
+        "8 bit",
+        "wrong counts",
+        lambda eye: eye.clean.with_raw(defects.eight_bits(eye.clean.raw, eye.spec.camera)),
+        "counts",
+    ),
     *(_case(f"black level off by {dn} DN", "wrong counts", offset(dn), "counts") for dn in (1, 5, 20)),
     _case("gain off by 2", "wrong counts", gain(2.0), "counts"),
     _case("gain off by 0.5", "wrong counts", gain(0.5), "counts", HALF_LIGHT),
-)  # fmt: skip
+)
 NAMED = {case.key: case for case in CASES}

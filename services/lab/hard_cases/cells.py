@@ -129,9 +129,18 @@ class CaseRunner:
         assert not isinstance(sphere, str)
         assert not isinstance(sd, str)
         return Cell(
-            self.eye.name, case.key, column, found, clean - found, "", made.report.warnings, sphere, sd,
-            frame.sphere_dpt, dict(made.report.quality),
-        )  # fmt: skip
+            self.eye.name,
+            case.key,
+            column,
+            found,
+            clean - found,
+            "",
+            made.report.warnings,
+            sphere,
+            sd,
+            frame.sphere_dpt,
+            dict(made.report.quality),
+        )
 
     def _region(self, frame: HardFrame) -> Mask:
         if frame.seen is None:

@@ -42,9 +42,11 @@ class HardCases:
 
 
 def run(
-    eyes: Sequence[Eye] = EYES, keys: Sequence[str] = (), columns: tuple[str, ...] = COLUMNS,
+    eyes: Sequence[Eye] = EYES,
+    keys: Sequence[str] = (),
+    columns: tuple[str, ...] = COLUMNS,
     progress: ProgressCallback = lambda line: None,
-) -> HardCases:  # fmt: skip
+) -> HardCases:
     """Run the cases `keys` (default: all) and the clean one of each eye through `columns`; return cells and violations.
 
     `progress` is called with one line per eye and case. SettingError for an unknown case or column.
@@ -91,11 +93,22 @@ def markdown(found: HardCases) -> str:
     """Return the Markdown report: table, explained losses, violations."""
     share, count = covered(found.cells)
     lines = [
-        "# Hard cases", "", "PCC inside the lit field, in brackets its change against the same method's clean frame.",
-        table(found.cells, found.columns), "", "## Explained losses", "",
-        *(f"* {where}: {why}" for where, why in explanations(found.cells).items()), "", "## Violations", "",
-        f"{share:.0%} of {count} refractions lie within two standard deviations.", "", summary(found), "",
-    ]  # fmt: skip
+        "# Hard cases",
+        "",
+        "PCC inside the lit field, in brackets its change against the same method's clean frame.",
+        table(found.cells, found.columns),
+        "",
+        "## Explained losses",
+        "",
+        *(f"* {where}: {why}" for where, why in explanations(found.cells).items()),
+        "",
+        "## Violations",
+        "",
+        f"{share:.0%} of {count} refractions lie within two standard deviations.",
+        "",
+        summary(found),
+        "",
+    ]
     return "\n".join(lines)
 
 

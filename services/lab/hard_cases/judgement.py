@@ -20,8 +20,13 @@ SIGMAS = 3.0
 COVERED, COVERED_SIGMAS = 0.9, 2.0
 SLACK = 0.02  # relative change of a quality figure from one noise realisation to another
 BETTER: Mapping[str, int] = {  # 1: larger is better, -1: smaller
-    "structure_nats": 1, "structure_sure": 1, "through": 1, "coverage": 1, "cutoff_per_px": 1, "resolution_um": -1,
-}  # fmt: skip
+    "structure_nats": 1,
+    "structure_sure": 1,
+    "through": 1,
+    "coverage": 1,
+    "cutoff_per_px": 1,
+    "resolution_um": -1,
+}
 KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("refraction", ("refraction",)),
     ("signal", ("no signal",)),
@@ -60,10 +65,12 @@ def violations(cells: Sequence[Cell], cases: Mapping[str, Case] = NAMED) -> list
     for cell in cells:
         case = cases[cell.case]
         words = {
-            "crash": cell.refused if cell.crashed else "", "hidden": _hidden(cell, case),
-            "refraction": _refraction(cell), "message": _message(cell, case),
+            "crash": cell.refused if cell.crashed else "",
+            "hidden": _hidden(cell, case),
+            "refraction": _refraction(cell),
+            "message": _message(cell, case),
             "quality": _quality(cell, clean[cell.eye, cell.method]),
-        }  # fmt: skip
+        }
         found += [Violation(rule, cell.eye, cell.case, cell.method, detail) for rule, detail in words.items() if detail]
     share, count = covered(cells)
     if count and share < COVERED:

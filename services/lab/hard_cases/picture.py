@@ -10,9 +10,12 @@ from services.lab.plot import STYLE, text
 
 LEFT, TOP, WIDE, TALL, GAP, SKIP = 250, 150, 104, 24, 2, 10
 SHADES = (  # upper limit of the loss, colour, text colour
-    (0.01, "#1a7f5a", "#ffffff"), (0.05, "#8fd0a8", "#10231a"), (0.15, "#f3dc8c", "#33290a"),
-    (0.4, "#e89a5b", "#2e1706"), (float("inf"), "#b8403a", "#ffffff"),
-)  # fmt: skip
+    (0.01, "#1a7f5a", "#ffffff"),
+    (0.05, "#8fd0a8", "#10231a"),
+    (0.15, "#f3dc8c", "#33290a"),
+    (0.4, "#e89a5b", "#2e1706"),
+    (float("inf"), "#b8403a", "#ffffff"),
+)
 REFUSED = "#8a8f98", "#ffffff"
 LEGEND = (
     "PCC inside the lit field; in brackets its change against the same method's clean frame",
@@ -43,14 +46,19 @@ def _document(eye: str, columns: Sequence[str], inner: Sequence[str], y: int) ->
     wide, tall = LEFT + len(columns) * WIDE + 150, y + 24
     heads = [text(LEFT + (k + 0.5) * WIDE, TOP - 10, name, "small", "middle") for k, name in enumerate(columns)]
     heads.append(text(LEFT + len(columns) * WIDE + 8, TOP - 10, "refraction error", "small"))
-    return "\n".join([
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
-        f'role="img" aria-label="Hard cases, {escape(eye)}"><style>{STYLE}</style>',
-        f'<rect class="ground" width="{wide}" height="{tall}"/>',
-        text(20, 32, f"Hard cases: {eye}", "title"),
-        *(text(20, 56 + 18 * k, line, "quiet small") for k, line in enumerate(LEGEND)),
-        *_scale(), *heads, *inner, "</svg>\n",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
+            f'role="img" aria-label="Hard cases, {escape(eye)}"><style>{STYLE}</style>',
+            f'<rect class="ground" width="{wide}" height="{tall}"/>',
+            text(20, 32, f"Hard cases: {eye}", "title"),
+            *(text(20, 56 + 18 * k, line, "quiet small") for k, line in enumerate(LEGEND)),
+            *_scale(),
+            *heads,
+            *inner,
+            "</svg>\n",
+        ]
+    )
 
 
 def _scale() -> list[str]:
@@ -71,11 +79,16 @@ def _cell(cell: Cell, x: int, y: int, broken: bool) -> list[str]:
         marks = ("m" if cell.warnings else "") + ("e" if explained else "")
         words = f"{cell.pcc:.2f} ({-cell.lost:+.2f}) {marks}".rstrip()
         says = " / ".join(cell.warnings)
-    out = [f"<g><title>{escape(f'{cell.case}, {cell.method}: {says}')}</title>",
-           _box(x, y, WIDE - GAP, TALL - GAP, colour), _label(x + WIDE / 2 - 1, y + TALL - 8, words, ink)]  # fmt: skip
+    out = [
+        f"<g><title>{escape(f'{cell.case}, {cell.method}: {says}')}</title>",
+        _box(x, y, WIDE - GAP, TALL - GAP, colour),
+        _label(x + WIDE / 2 - 1, y + TALL - 8, words, ink),
+    ]
     if broken:
-        out.append(f'<rect x="{x + 1}" y="{y + 1}" width="{WIDE - GAP - 2}" height="{TALL - GAP - 2}" fill="none" '
-                   'stroke="#e00000" stroke-width="3"/>')  # fmt: skip
+        out.append(
+            f'<rect x="{x + 1}" y="{y + 1}" width="{WIDE - GAP - 2}" height="{TALL - GAP - 2}" fill="none" '
+            'stroke="#e00000" stroke-width="3"/>'
+        )
     return [*out, "</g>"]
 
 
@@ -100,12 +113,19 @@ def table(cells: Sequence[Cell], columns: Sequence[str]) -> str:
     lines: list[str] = []
     for eye in dict.fromkeys(cell.eye for cell in cells):
         mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
-        lines += ["", f"## {eye}", "", f"| case | {' | '.join(columns)} | refraction | messages |",
-                  "|---|" + "---|" * (len(columns) + 2)]  # fmt: skip
+        lines += [
+            "",
+            f"## {eye}",
+            "",
+            f"| case | {' | '.join(columns)} | refraction | messages |",
+            "|---|" + "---|" * (len(columns) + 2),
+        ]
         for case in dict.fromkeys(cell.case for cell in cells if cell.eye == eye):
             row = mine[case, columns[0]]
-            lines.append(f"| {case} | {' | '.join(_figures(mine[case, name]) for name in columns)} | "
-                         f"{_refraction(row)} | {' '.join(row.warnings) or row.refused} |")  # fmt: skip
+            lines.append(
+                f"| {case} | {' | '.join(_figures(mine[case, name]) for name in columns)} | "
+                f"{_refraction(row)} | {' '.join(row.warnings) or row.refused} |"
+            )
     return "\n".join(lines)
 
 

@@ -258,8 +258,11 @@ def with_merged_pixels(spec: InstrumentSpec, n: int) -> InstrumentSpec:
     camera = spec.camera
     assert spec.sim is not None
     merged: HeadChanges = {
-        "camera.rows": camera.rows // n, "camera.cols": camera.cols // n, "camera.pitch_um": camera.pitch_um * n,
-        "camera.full_well_e": camera.full_well_e * n**2, "camera.read_noise_e": camera.read_noise_e * n,
+        "camera.rows": camera.rows // n,
+        "camera.cols": camera.cols // n,
+        "camera.pitch_um": camera.pitch_um * n,
+        "camera.full_well_e": camera.full_well_e * n**2,
+        "camera.read_noise_e": camera.read_noise_e * n,
         "sim.peak_e": spec.sim.peak_e if spec.sim.peak_e == "budget" else spec.sim.peak_e * n**2,
-    }  # fmt: skip
+    }
     return with_changes(spec, merged)

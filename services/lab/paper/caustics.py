@@ -24,9 +24,10 @@ WALK = {15.0: 1.0, 25.0: 1.0, 26.0: 0.969, 28.0: 0.624, 30.0: 0.180}  # OPTICS.m
 PRINTED = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}
 WALK_GIVEN = "the simulator was given the walk of T"
 WHERE = {
-    26.0: "; the paper has no number here", 28.0: "; the paper has no number here",
+    26.0: "; the paper has no number here",
+    28.0: "; the paper has no number here",
     30.0: "; the paper's 6.3 % is missed, which the next row counts",
-}  # fmt: skip
+}
 TRACED_NOTE = (
     "Why 18 % of the light are left at 30 degrees here, and 21.5 % in T: T takes the beam's outline as the lenses bend "
     "it, which is no circle there; the simulator moves a round beam by the traced walk of its middle. The paper has "
@@ -68,20 +69,29 @@ def run_caustic(bench: Bench) -> Outcome:
     claims = (
         within("contrast of the caustic at 6 mm", over_z[6], 1.1, 1.5),
         within("contrast through the 275 um dot", through_dot, 0.7, 0.95),
-        below("largest change of contrast from 5 to 8 mm", max(map(abs, near)), 0.10,
-              "precise control is not required").adapted(
-            "the paper prints no number; read as: contrast within 10 %, for four random surfaces in the simulator"),
+        below(
+            "largest change of contrast from 5 to 8 mm", max(map(abs, near)), 0.10, "precise control is not required"
+        ).adapted(
+            "the paper prints no number; read as: contrast within 10 %, for four random surfaces in the simulator"
+        ),
         above("likeness of red and green caustic", _correlation(colours["red"], colours["green"]), 0.95),
         above("likeness of green and blue caustic", _correlation(colours["green"], colours["blue"]), 0.95),
-    )  # fmt: skip
-    shown = (
-        plane("caustic of a point, green", colours["green"], _bright(colours["green"])),
-        plane("through the 275 um dot, as calibrated",
-              convolved_with_disc(colours["green"], DOT_ON_SENSOR_UM / PITCH_UM)),
-        trend("The caustic is sharp over millimetres", "mean of four diffusers, 0.5 degrees, 70 um",
-              "diffuser to sensor, mm", "contrast: deviation over mean", {"contrast": over_z}),
-    )  # fmt: skip
-    return Outcome(claims, shown)
+    )
+    return Outcome(claims, _shown(colours["green"], over_z))
+
+
+def _shown(green: Image, over_z: dict[float, float]) -> tuple[Figure, ...]:
+    return (
+        plane("caustic of a point, green", green, _bright(green)),
+        plane("through the 275 um dot, as calibrated", convolved_with_disc(green, DOT_ON_SENSOR_UM / PITCH_UM)),
+        trend(
+            "The caustic is sharp over millimetres",
+            "mean of four diffusers, 0.5 degrees, 70 um",
+            "diffuser to sensor, mm",
+            "contrast: deviation over mean",
+            {"contrast": over_z},
+        ),
+    )
 
 
 def _middle(image: Image, shape: tuple[int, ...]) -> Image:
@@ -116,8 +126,11 @@ def run_walk(bench: Bench) -> Outcome:
         low, high = expected - 0.002, expected + 0.002
         quoted = printed if expected == 1 else ""
         claim = within(f"light of a dot at {angle_deg:g} degrees, by two discs", share, low, high, quoted, 4)
-        claims.append(claim.put_in(WALK_GIVEN + WHERE.get(angle_deg, "")).limit_from(
-            f"{expected:g}: overlap of iris and beam, two discs; +- 0.002 of pixels"))  # fmt: skip
+        claims.append(
+            claim.put_in(WALK_GIVEN + WHERE.get(angle_deg, "")).limit_from(
+                f"{expected:g}: overlap of iris and beam, two discs; +- 0.002 of pixels"
+            )
+        )
         rows.append((f"{angle_deg:g}", f"{share:.4f}", f"{expected:g}", printed))
         if angle_deg >= 25:
             shown.append(plane(f"caustic at {angle_deg:g} degrees", point))
@@ -139,11 +152,17 @@ def _cost_of_walk(bench: Bench) -> tuple[Claim, ...]:
     near, far = (still - walking for still, walking in zip(*found, strict=True))
     how = "the walk of T was given, its cost is computed; the paper prints no score"
     return (
-        below("PCC lost by the walk, dots within 25 degrees, paper's solver", near, 0.01,
-              "LSI approximately maintained", 4).adapted(how),
-        above("PCC lost by the walk, dots beyond 25 degrees, paper's solver", far, 0.05,
-              "violation of LSI").adapted(how),
-    )  # fmt: skip
+        below(
+            "PCC lost by the walk, dots within 25 degrees, paper's solver",
+            near,
+            0.01,
+            "LSI approximately maintained",
+            4,
+        ).adapted(how),
+        above("PCC lost by the walk, dots beyond 25 degrees, paper's solver", far, 0.05, "violation of LSI").adapted(
+            how
+        ),
+    )
 
 
 def pcc_between(take: SimulatedFrame, picture: Image, from_deg: float, to_deg: float) -> float:
@@ -156,16 +175,20 @@ def pcc_between(take: SimulatedFrame, picture: Image, from_deg: float, to_deg: f
 
 EXPERIMENTS = (
     Experiment(
-        "S0", "The caustic",
+        "S0",
+        "The caustic",
         "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm, in every colour. "
         "Contrast is the standard deviation over the mean, in the middle 60 % of the iris's image.",
-        "Figures 1 and 3a; \"precise control of this distance is not required\".", run_caustic,
+        'Figures 1 and 3a; "precise control of this distance is not required".',
+        run_caustic,
     ),
     Experiment(
-        "S8", "The beam walks over the iris",
+        "S8",
+        "The beam walks over the iris",
         "Up to 25 degrees the beam fills the iris; at 30 degrees a fifth of it is left (T). What that costs is seen in "
         "dots as wide as those of S7 on a curved screen.",
-        "Section \"Optical design\": linear shift-invariance (LSI) is approximately maintained up to 25 degrees and "
-        "violated beyond; 6.3 % of the aperture is lit at 30 degrees.", run_walk,
+        'Section "Optical design": linear shift-invariance (LSI) is approximately maintained up to 25 degrees and '
+        "violated beyond; 6.3 % of the aperture is lit at 30 degrees.",
+        run_walk,
     ),
-)  # fmt: skip
+)

@@ -33,33 +33,64 @@ NOTES = (
 def run_numbers(bench: Bench) -> Outcome:
     """Evaluate the formulas; this experiment simulates nothing."""
     relay = Relay()
-    lit_mm = extent_mm(relay, 50)
     claims: tuple[Claim, ...] = (
         within("field of 15 mm behind a lens of 25 mm, degrees", field_deg(15), 33.35, 33.45, "33.4", 2)
-        .because(PRINTED_FOCUS).limit_from(ROUNDED),
+        .because(PRINTED_FOCUS)
+        .limit_from(ROUNDED),
         within("field of 24 mm behind a lens of 25 mm, degrees", field_deg(24), 51.2, 51.3, "51.2", 2)
-        .because(PRINTED_FOCUS).limit_from("51.28 is printed as 51.2: cut off after one decimal, not rounded"),
+        .because(PRINTED_FOCUS)
+        .limit_from("51.28 is printed as 51.2: cut off after one decimal, not rounded"),
         within("correction Rx of a screen at 29 mm, dpt", correction_dpt(29), -5.55, -5.45, "-5.5", 2)
-        .because(PRINTED_FOCUS).limit_from(ROUNDED),
+        .because(PRINTED_FOCUS)
+        .limit_from(ROUNDED),
         within("correction Rx of a screen at 21 mm, dpt", correction_dpt(21), 7.55, 7.65, "+7.6", 2)
-        .because(PRINTED_FOCUS).limit_from(ROUNDED),
-        within("field lit by an LED's cone of 24.75 degrees, degrees", 24.75 * relay.pupil_magnification, 32.5, 33.5,
-               "33", 2).put_in("the paper prints no cone: 24.75 is its 33 over f2 / f1").limit_from(ROUNDED),
-        above("sensor's long side over d + 2s at 50 degrees", LONG_MM / lit_mm, 1.0, "D > d + 2s for > 50 degrees", 2)
-        .adapted(LONG_SIDE).limit_from("the rule: D is more than d + 2s"),
-        below("rule broken on the short side: D over d + 2s, 50 degrees", SHORT_MM / lit_mm, 1.0, "", 2)
-        .ours("the paper does not mention the short side").limit_from("the rule is broken below 1"),
-        within("field that the rule allows on the short side, degrees", strict_field_deg(relay, SHORT_MM), 28.5, 28.6,
-               "", 2).ours("the paper's rule on its own sensor; it contradicts the paper's 33 and 50 degrees")
-        .limit_from("by hand: (5.443 - 3.2) mm / (0.75 x 6 mm) is 28.56 degrees"),
-    )  # fmt: skip
+        .because(PRINTED_FOCUS)
+        .limit_from(ROUNDED),
+        within(
+            "field lit by an LED's cone of 24.75 degrees, degrees",
+            24.75 * relay.pupil_magnification,
+            32.5,
+            33.5,
+            "33",
+            2,
+        )
+        .put_in("the paper prints no cone: 24.75 is its 33 over f2 / f1")
+        .limit_from(ROUNDED),
+        *_sensor_claims(relay),
+    )
     return Outcome(claims, notes=NOTES)
+
+
+def _sensor_claims(relay: Relay) -> tuple[Claim, ...]:
+    """Return the claims on the paper's rule for the size of the sensor."""
+    lit_mm = extent_mm(relay, 50)
+    return (
+        above("sensor's long side over d + 2s at 50 degrees", LONG_MM / lit_mm, 1.0, "D > d + 2s for > 50 degrees", 2)
+        .adapted(LONG_SIDE)
+        .limit_from("the rule: D is more than d + 2s"),
+        below("rule broken on the short side: D over d + 2s, 50 degrees", SHORT_MM / lit_mm, 1.0, "", 2)
+        .ours("the paper does not mention the short side")
+        .limit_from("the rule is broken below 1"),
+        within(
+            "field that the rule allows on the short side, degrees",
+            strict_field_deg(relay, SHORT_MM),
+            28.5,
+            28.6,
+            "",
+            2,
+        )
+        .ours("the paper's rule on its own sensor; it contradicts the paper's 33 and 50 degrees")
+        .limit_from("by hand: (5.443 - 3.2) mm / (0.75 x 6 mm) is 28.56 degrees"),
+    )
 
 
 EXPERIMENTS = (
     Experiment(
-        "N", "The paper's numbers", "Numbers of the paper's optics, by the formula that gives them; nothing is "
+        "N",
+        "The paper's numbers",
+        "Numbers of the paper's optics, by the formula that gives them; nothing is "
         "simulated. The notes name six places where the paper contradicts itself or says less than it should.",
-        "Sections \"Optical design\", \"Results\" and \"Discussion\".", run_numbers,
+        'Sections "Optical design", "Results" and "Discussion".',
+        run_numbers,
     ),
-)  # fmt: skip
+)

@@ -38,16 +38,22 @@ def run_grid(bench: Bench) -> Outcome:
     }
     count = {rule: sum(one.rule == rule for one in found.violations) for rule in rules}
     claims = (
-        *(below(words, count[rule], 1, digits=0).ours(EXPLAINED if rule == "hidden" else "")
-          .limit_from("none may occur") for rule, words in rules.items()),
-        above(f"share of {refractions} refractions within 2 standard deviations", share, COVERED)
-        .limit_from("95 % if the standard deviations are right, less 5 % for their number"),
-    )  # fmt: skip
+        *(
+            below(words, count[rule], 1, digits=0)
+            .ours(EXPLAINED if rule == "hidden" else "")
+            .limit_from("none may occur")
+            for rule, words in rules.items()
+        ),
+        above(f"share of {refractions} refractions within 2 standard deviations", share, COVERED).limit_from(
+            "95 % if the standard deviations are right, less 5 % for their number"
+        ),
+    )
     shown = tuple(Figure(f"Hard cases: {eye}", _address(found.picture(eye)), wide=True) for eye in found.eyes)
     why = _unsaid(unsaid, found.cells)
-    broken = Table(("rule", "eye", "case", "method", "what is seen"), tuple(
-        (one.rule, one.eye, one.case, one.method, one.words) for one in found.violations
-    ))  # fmt: skip
+    broken = Table(
+        ("rule", "eye", "case", "method", "what is seen"),
+        tuple((one.rule, one.eye, one.case, one.method, one.words) for one in found.violations),
+    )
     note = (
         f"{MERGED} x {MERGED} pixels are merged here, and only the default schedule (`ladder` in table and pictures) "
         "runs; `diffuscope hard -o DIR` runs the whole sensor with every method. A loss is a PCC below that of the "
@@ -63,9 +69,15 @@ def _unsaid(cells: Sequence[Cell], every: Sequence[Cell]) -> Table:
     """Return the losses without a message, with the resolution figure beside the clean frame's and our explanation."""
     clean = {cell.eye: cell for cell in every if cell.case == CLEAN.key}
     rows = tuple(
-        (f"{cell.case}, {cell.eye}", f"{cell.lost:.3f}", _resolution(cell), _resolution(clean[cell.eye]),
-         explanation(cell, NAMED[cell.case])) for cell in cells
-    )  # fmt: skip
+        (
+            f"{cell.case}, {cell.eye}",
+            f"{cell.lost:.3f}",
+            _resolution(cell),
+            _resolution(clean[cell.eye]),
+            explanation(cell, NAMED[cell.case]),
+        )
+        for cell in cells
+    )
     head = ("loss above .05 without a message", "PCC lost", "resolution, um", "clean frame's, um", "our explanation")
     return Table(head, rows)
 
@@ -82,7 +94,10 @@ def _address(svg: str) -> str:
 
 EXPERIMENTS = (
     Experiment(
-        "S13", "The grid of hard cases", "Three eyes, each with every kind of bad frame, by the default schedule.",
-        "Not in the paper.", run_grid,
+        "S13",
+        "The grid of hard cases",
+        "Three eyes, each with every kind of bad frame, by the default schedule.",
+        "Not in the paper.",
+        run_grid,
     ),
-)  # fmt: skip
+)

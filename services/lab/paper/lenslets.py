@@ -82,13 +82,25 @@ def run_lenslets(bench: Bench) -> Outcome:
     kept = strained["lenslets"].scores[0] - strained["diffuser"].scores[0]
     claims = (
         *(_passes(kind, passed) for kind in KINDS[1:]),
-        above("evenness of |H|, diffuser over square array", passed["diffuser"][1] / passed["microlenses"][1], 1.0,
-              EVEN, 2).adapted(HOW).limit_from("the paper's ordering"),
-        *(above(f"PCC, {NAMES[kind]} minus diffuser, least of {len(SEEDS)} eyes", min(gain), 0.0).ours(FUTURE)
-          .limit_from("better in every eye") for kind, gain in gains.items()),
-        above(f"PCC, aperiodic lenslets minus diffuser, an eye of {MYOPIA_DPT:g} dpt", kept, 0.0).ours(
-            f"{FUTURE}; refraction estimated from the frame").limit_from("better"),
-    )  # fmt: skip
+        above(
+            "evenness of |H|, diffuser over square array",
+            passed["diffuser"][1] / passed["microlenses"][1],
+            1.0,
+            EVEN,
+            2,
+        )
+        .adapted(HOW)
+        .limit_from("the paper's ordering"),
+        *(
+            above(f"PCC, {NAMES[kind]} minus diffuser, least of {len(SEEDS)} eyes", min(gain), 0.0)
+            .ours(FUTURE)
+            .limit_from("better in every eye")
+            for kind, gain in gains.items()
+        ),
+        above(f"PCC, aperiodic lenslets minus diffuser, an eye of {MYOPIA_DPT:g} dpt", kept, 0.0)
+        .ours(f"{FUTURE}; refraction estimated from the frame")
+        .limit_from("better"),
+    )
     return Outcome(claims, tuple(_shown(found)), (_table(found, passed),), _notes(gains, strained))
 
 
@@ -115,10 +127,14 @@ def _table(found: dict[str, list[Trial]], passed: dict[str, list[float]]) -> Tab
     for kind, trials in found.items():
         scores = np.array([one.scores for one in trials])
         mean, spread = scores.mean(axis=0), scores.std(axis=0, ddof=1)
-        rows.append((
-            NAMES[kind], *(f"{mean[i]:.{n}f} +- {spread[i]:.{n}f}" for i, n in enumerate((3, 1, 3))),
-            f"{passed[kind][0]:.3f}", f"{passed[kind][1]:.2f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                NAMES[kind],
+                *(f"{mean[i]:.{n}f} +- {spread[i]:.{n}f}" for i, n in enumerate((3, 1, 3))),
+                f"{passed[kind][0]:.3f}",
+                f"{passed[kind][1]:.2f}",
+            )
+        )
     head = ("element", "PCC, mean +- sd", "PSNR, dB", "vessel contrast", "rms of |H|", "evenness of |H|")
     return Table(head, tuple(rows))
 
@@ -169,12 +185,13 @@ def _notes(gains: dict[str, list[float]], strained: dict[str, Trial]) -> tuple[s
 
 EXPERIMENTS = (
     Experiment(
-        "D", "Lenslets instead of the diffuser",
+        "D",
+        "Lenslets instead of the diffuser",
         "Three eyes in the light of the paper's head, behind a diffuser, a square array of microlenses and aperiodic "
         "lenslets of the same pitch, solved by the default method.",
-        "\"The image contrast can also be significantly improved by using a properly-designed microlens array or "
-        "customized aperiodic microlens array\"; the caustic \"produces a better evenly distributed transfer "
-        "function\" than a microlens array.",
+        '"The image contrast can also be significantly improved by using a properly-designed microlens array or '
+        'customized aperiodic microlens array"; the caustic "produces a better evenly distributed transfer '
+        'function" than a microlens array.',
         run_lenslets,
     ),
-)  # fmt: skip
+)

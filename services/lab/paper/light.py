@@ -20,8 +20,12 @@ from services.lab.paper.pictures import plane, side_by_side
 BRIGHT_SHARE = 15000 / 23000  # of the full well, in the brightest pixel: the light of sim.toml
 WEAK, STRONG = "imx296", "imx296_power"  # one sensor in the light of two rings
 SEEN_PCC = {  # the smaller of full and merged pixels; the high-power ring's truth has its soft edge, which adds to it
-    "imx296": 0.893, "imx296_power": 0.980, "imx477": 0.895, "paper": 0.912, "sim": 0.908,
-}  # fmt: skip
+    "imx296": 0.893,
+    "imx296_power": 0.980,
+    "imx477": 0.895,
+    "paper": 0.912,
+    "sim": 0.908,
+}
 SLACK = 0.01  # tolerance of a PCC below the measured one
 FILE, HEADS_FILE = "human-eye.png", "heads-eye.png"
 NOTE = (
@@ -88,8 +92,16 @@ def head_pictures(bench: Bench, names: Sequence[str]) -> dict[str, HeadPictures]
 
 
 def _sensor(camera: CameraSpec) -> tuple[float, ...]:
-    return (camera.rows, camera.cols, camera.pitch_um, camera.bit_depth, camera.black_dn, camera.full_well_e,
-            camera.read_noise_e, camera.exposure_s)  # fmt: skip
+    return (
+        camera.rows,
+        camera.cols,
+        camera.pitch_um,
+        camera.bit_depth,
+        camera.black_dn,
+        camera.full_well_e,
+        camera.read_noise_e,
+        camera.exposure_s,
+    )
 
 
 def run_light(bench: Bench) -> Outcome:
@@ -102,9 +114,13 @@ def run_light(bench: Bench) -> Outcome:
         for name, one in found.items()
     ]
     claims.append(
-        above("vessel contrast with the high-power ring over that with the LuMini", contrasts[1] / contrasts[0], 1.0,
-              digits=2).limit_from("five times the light cannot show less")
-    )  # fmt: skip
+        above(
+            "vessel contrast with the high-power ring over that with the LuMini",
+            contrasts[1] / contrasts[0],
+            1.0,
+            digits=2,
+        ).limit_from("five times the light cannot show less")
+    )
     shown = [figure for one in found.values() for figure in _row(one)]
     first, second = weak.light.mean_e, strong.light.mean_e
     words = (
@@ -140,21 +156,38 @@ def _table(found: dict[str, HeadPictures]) -> Table:
     for one in found.values():
         light, take, contrast = one.light, one.take, one.take.judge.truth_contrast
         assert contrast is not None
-        rows.append((
-            light.head, f"{light.mean_e:.0f}", f"{light.peak_e:.0f}", f"{1000 * light.exposure_s:g}",
-            *(f"{take.score(picture).pcc:.3f}" for picture in (one.human, one.bright)),
-            *(f"{_contrast(take, picture):.3f}" for picture in (one.human, one.bright)), f"{contrast:.3f}",
-        ))  # fmt: skip
-    head = ("head", "mean of the lit disc, e-", "brightest pixel, about, e-", "exposure, ms", "PCC", "in bright light",
-            "vessel contrast", "in bright light", "of the truth")  # fmt: skip
+        rows.append(
+            (
+                light.head,
+                f"{light.mean_e:.0f}",
+                f"{light.peak_e:.0f}",
+                f"{1000 * light.exposure_s:g}",
+                *(f"{take.score(picture).pcc:.3f}" for picture in (one.human, one.bright)),
+                *(f"{_contrast(take, picture):.3f}" for picture in (one.human, one.bright)),
+                f"{contrast:.3f}",
+            )
+        )
+    head = (
+        "head",
+        "mean of the lit disc, e-",
+        "brightest pixel, about, e-",
+        "exposure, ms",
+        "PCC",
+        "in bright light",
+        "vessel contrast",
+        "in bright light",
+        "of the truth",
+    )
     return Table(head, tuple(rows))
 
 
 EXPERIMENTS = (
     Experiment(
-        "L", "The light of a human eye",
+        "L",
+        "The light of a human eye",
         "How many electrons a human fundus gives with each shipped head at full drive, and what a picture is then, "
         "beside one in bright light (0.65 of the full well in the brightest pixel).",
-        "Not in the paper, which shows screens, prints and model eyes.", run_light,
+        "Not in the paper, which shows screens, prints and model eyes.",
+        run_light,
     ),
-)  # fmt: skip
+)

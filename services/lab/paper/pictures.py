@@ -62,8 +62,7 @@ def cutline(take: SimulatedFrame, down_deg: float, pictures: Mapping[str, Image]
         lines[name] = fit_intensity(picture.astype(np.float64), truth, take.inside)[row, cols]
     peak = max(float(np.abs(truth[take.inside]).max()), 1e-30)
     scaled = {name: values / peak for name, values in lines.items()}
-    return _lines(title, _where(down_deg), "degrees from the axis", "share of the brightest",
-                  degrees, scaled)  # fmt: skip
+    return _lines(title, _where(down_deg), "degrees from the axis", "share of the brightest", degrees, scaled)
 
 
 def raw_cutlines(takes: Mapping[str, SimulatedFrame], down_deg: float, title: str) -> Figure:
@@ -110,8 +109,9 @@ def _lines(title: str, under: str, across: str, up: str, x: np.ndarray, lines: M
         for name, values in lines.items()
     )
     every = np.concatenate(list(lines.values()))
-    plot = Plot(title, under, title, value_axis(x.tolist(), across, 0.0), value_axis(every.tolist(), up), series,
-                height=340)  # fmt: skip
+    plot = Plot(
+        title, under, title, value_axis(x.tolist(), across, 0.0), value_axis(every.tolist(), up), series, height=340
+    )
     return _svg(title, plot)
 
 

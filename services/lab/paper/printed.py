@@ -33,9 +33,14 @@ MOVED_NOTE = (
 )
 WIDER_CONE_DEG, HALF_OF_DEG = 30.0, 10.0
 WIDE_LATTICE: HeadChanges = {
-    "optics.field_deg": 62.0, "sim.object.dots_apart_um": 980.0, "sim.object.half_size_um": (14700.0, 1960.0),
-    "sim.eye.surface": "flat", "sim.eye.walks": True, "sim.light.falloff": False, "sim.light.vignette_deg": 180.0,
-}  # fmt: skip
+    "optics.field_deg": 62.0,
+    "sim.object.dots_apart_um": 980.0,
+    "sim.object.half_size_um": (14700.0, 1960.0),
+    "sim.eye.surface": "flat",
+    "sim.eye.walks": True,
+    "sim.light.falloff": False,
+    "sim.light.vignette_deg": 180.0,
+}
 LATTICE = "a lattice over 61 degrees, as bright at its edge as in the middle (within 3 %)"
 LIMITED = "limited by the extent of the LED illumination"
 POSITIONS = {"left": -MOVED_DEG, "middle": 0.0, "right": MOVED_DEG}
@@ -60,27 +65,34 @@ def run_rulers(bench: Bench) -> Outcome:
     sparse, dense = bench.expose("paper_ruler_positive"), bench.expose("paper_ruler_negative")
     mu, _, _ = bench.best_mu(dense)
     white, black = (np.maximum(bench.tikhonov(take, mu), 0) for take in (sparse, dense))
-    flat = bench.solve(dense, "gradient")
-    ours = bench.solve(dense, "variation")
+    flat, ours = (bench.solve(dense, method) for method in ("gradient", "variation"))
     long_deg = ruler_deg(bench.tikhonov(sparse, DOT_MU), sparse)
     one, two, three, four = sparse.score(white), dense.score(black), dense.score(flat), dense.score(ours)
     even = sparse.score(sparse.flat_field_corrected(white)), dense.score(dense.flat_field_corrected(black))
     claims = (
-        within("15 mm as reconstructed, degrees", long_deg, 33.1, 33.7, "33.4", 2)
-        .put_in("the scene's ruler is 33.4 degrees long: the row shows that the picture keeps its length"),
+        within("15 mm as reconstructed, degrees", long_deg, 33.1, 33.7, "33.4", 2).put_in(
+            "the scene's ruler is 33.4 degrees long: the row shows that the picture keeps its length"
+        ),
         *_two_rulers(one, two, even),
         above("PCC of the black ruler, flat-sub", three.pcc, 0.89),
         above("PCC of the black ruler, our default", four.pcc, 0.9),
-        above("contrast of the raw frame, white ruler over black", _contrast(sparse) / _contrast(dense), 2.0,
-              "higher contrast (4b)"),
-    )  # fmt: skip
-    rows = tuple(
-        (name, f"{s.pcc:.3f}", f"{s.psnr_db:.1f}", f"{s.ssim:.2f}")
-        for name, s in (("white on black, paper's solver", one), ("black on white, paper's solver", two),
-                        ("white on black, the same, flat field", even[0]),
-                        ("black on white, the same, flat field", even[1]),
-                        ("black on white, flat-sub", three), (f"black on white, {DEFAULT}", four))
-    )  # fmt: skip
+        above(
+            "contrast of the raw frame, white ruler over black",
+            _contrast(sparse) / _contrast(dense),
+            2.0,
+            "higher contrast (4b)",
+        ),
+    )
+    rows = _score_rows(
+        {
+            "white on black, paper's solver": one,
+            "black on white, paper's solver": two,
+            "white on black, the same, flat field": even[0],
+            "black on white, the same, flat field": even[1],
+            "black on white, flat-sub": three,
+            f"black on white, {DEFAULT}": four,
+        }
+    )
     shown = (
         *compared(sparse, {f"paper's solver, mu {mu:.0e}": white}, "white ruler"),
         *compared(dense, {f"paper's solver, mu {mu:.0e}": black, "flat-sub": flat, DEFAULT: ours}, "black ruler"),
@@ -89,6 +101,10 @@ def run_rulers(bench: Bench) -> Outcome:
         cutline(dense, -1.6, {"paper's solver": black, DEFAULT: ours}, "Black ruler, across the ticks"),
     )
     return Outcome(claims, shown, (Table(("picture", "PCC", "PSNR, dB", "SSIM"), rows),), (_rulers_note(even),))
+
+
+def _score_rows(scores: dict[str, Scores]) -> tuple[tuple[str, ...], ...]:
+    return tuple((name, f"{s.pcc:.3f}", f"{s.psnr_db:.1f}", f"{s.ssim:.2f}") for name, s in scores.items())
 
 
 def _rulers_note(even: tuple[Scores, Scores]) -> str:
@@ -106,20 +122,33 @@ def _two_rulers(white: Scores, black: Scores, even: tuple[Scores, Scores]) -> tu
     """Return the claims on the scores of both rulers by the paper's solver; `even`: after flat-field correction."""
     gone = "gone after the flat-field correction, with which the paper has it; seen only without it"
     return (
-        above("PSNR after the flat field, white ruler minus black, dB", even[0].psnr_db - even[1].psnr_db, 4.0,
-              "much reduced", 1).as_attempt().because(f"{gone} (+{white.psnr_db - black.psnr_db:.1f} dB)")
+        above(
+            "PSNR after the flat field, white ruler minus black, dB",
+            even[0].psnr_db - even[1].psnr_db,
+            4.0,
+            "much reduced",
+            1,
+        )
+        .as_attempt()
+        .because(f"{gone} (+{white.psnr_db - black.psnr_db:.1f} dB)")
         .limit_from(MUCH),
         above("SSIM after the flat field, white ruler minus black", even[0].ssim - even[1].ssim, 0.15, "much reduced")
-        .as_attempt().because(f"{gone} (+{white.ssim - black.ssim:.2f})").limit_from(MUCH),
+        .as_attempt()
+        .because(f"{gone} (+{white.ssim - black.ssim:.2f})")
+        .limit_from(MUCH),
         attempted("PCC, white ruler minus black", white.pcc - black.pcc, -0.05, 0.05, "remains similar")
-        .because("without the flat-field correction it falls with the PSNR; tried: weights from 1e-6 to 1e-3, of which "
-                 f"this one has the least difference. With the correction {even[0].pcc - even[1].pcc:+.2f}, but then "
-                 "the two rows above fail").limit_from("similar: within 0.05, our reading"),
-        above("PSNR without flat field, white ruler minus black, dB", white.psnr_db - black.psnr_db, 4.0, "", 1)
-        .ours(UNCORRECTED),
+        .because(
+            "without the flat-field correction it falls with the PSNR; tried: weights from 1e-6 to 1e-3, of which "
+            f"this one has the least difference. With the correction {even[0].pcc - even[1].pcc:+.2f}, but then "
+            "the two rows above fail"
+        )
+        .limit_from("similar: within 0.05, our reading"),
+        above("PSNR without flat field, white ruler minus black, dB", white.psnr_db - black.psnr_db, 4.0, "", 1).ours(
+            UNCORRECTED
+        ),
         above("SSIM without flat field, white ruler minus black", white.ssim - black.ssim, 0.15).ours(UNCORRECTED),
         above("PCC of the black ruler, paper's solver", black.pcc, 0.85),
-    )  # fmt: skip
+    )
 
 
 def _contrast(take: SimulatedFrame) -> float:
@@ -171,20 +200,28 @@ def run_prints(bench: Bench) -> Outcome:
     spots, seen = _sum(one.spots for one in found.values())
     off = [misregistration(found, name) for name in ("left", "right")]
     claims = (
-        above("edges on nine cutlines with the truth's sign, share", same / max(asked, 1), 0.999, CAPTURED)
-        .limit_from("every one of them"),
-        above("clear edges of the truth on the nine cutlines, number", asked, 20, "", 0)
-        .limit_from("so that one edge is at most 5 %"),
+        above("edges on nine cutlines with the truth's sign, share", same / max(asked, 1), 0.999, CAPTURED).limit_from(
+            "every one of them"
+        ),
+        above("clear edges of the truth on the nine cutlines, number", asked, 20, "", 0).limit_from(
+            "so that one edge is at most 5 %"
+        ),
         above("bright and dark spots with the truth's sign, share", seen / max(spots, 1), 0.75, CAPTURED),
-        above("bright and dark spots of the truth, number", spots, 20, "", 0)
-        .limit_from("so that one spot is at most 5 %"),
-        below("distance between a feature in two positions, samples", max(off), 1.0, "", 2)
-        .limit_from("one sample of 0.13 degrees"),
-    )  # fmt: skip
+        above("bright and dark spots of the truth, number", spots, 20, "", 0).limit_from(
+            "so that one spot is at most 5 %"
+        ),
+        below("distance between a feature in two positions, samples", max(off), 1.0, "", 2).limit_from(
+            "one sample of 0.13 degrees"
+        ),
+    )
     rows = tuple(
-        (name, *(f"{one.take.score(x).pcc:.3f}" for x in (one.paper, one.flat)),
-         *(f"{got}/{of}" for of, got in (one.edges, one.spots))) for name, one in found.items()
-    )  # fmt: skip
+        (
+            name,
+            *(f"{one.take.score(x).pcc:.3f}" for x in (one.paper, one.flat)),
+            *(f"{got}/{of}" for of, got in (one.edges, one.spots)),
+        )
+        for name, one in found.items()
+    )
     sheet = Table(("position", "PCC, paper's solver", "PCC, flat-sub", "edges followed", "spots followed"), rows)
     return Outcome(claims, _shown(found), (sheet,), (MOVED_NOTE, _clear_edges(faint, faint_same)))
 
@@ -217,8 +254,11 @@ def misregistration(found: Mapping[str, Position], name: str) -> float:
     for which, at_deg in ((name, shared_deg), ("middle", shared_deg - POSITIONS[name])):
         row, col = take.row(0), take.column(0) + round(at_deg * take.px_per_deg)
         patches.append(found[which].flat[row - half : row + half, col - half : col + half])
-    moved = (round(shared_deg * take.px_per_deg) - round((shared_deg - POSITIONS[name]) * take.px_per_deg)
-             - POSITIONS[name] * take.px_per_deg)  # fmt: skip
+    moved = (
+        round(shared_deg * take.px_per_deg)
+        - round((shared_deg - POSITIONS[name]) * take.px_per_deg)
+        - POSITIONS[name] * take.px_per_deg
+    )
     down, right = shift_px(patches[0], patches[1])
     return float(np.hypot(down, right + moved))
 
@@ -277,24 +317,48 @@ def run_fields(bench: Bench) -> Outcome:
     found_deg, half_deg = lattice_deg(shining, dots)
     to_rims_deg = field_to_rims_deg(relay, led_mm)
     claims = (
-        within("print lit by a cone of 24.75 degrees, degrees", lit_deg, 32, 34, "33 (33.4)", 1)
-        .put_in("the paper prints no cone: 24.75 is its 33 over f2 / f1").limit_from("the paper's 33 +- 1"),
-        within("print lit by a cone of 30 degrees, degrees", wide_deg, round(fields[1] - 1.5, 1),
-               round(fields[1] + 1.5, 1), LIMITED, 1)
-        .adapted("the cone is wider than the paper's; if something else limits the field, it does not grow")
-        .limit_from(f"traced light: {fields[1]:.1f} degrees; +- 1.5, blur and sample at both edges"),
+        *_cone_claims(lit_deg, wide_deg, fields[1]),
         above("even dots found on a flat screen, degrees", found_deg, 51.2, "51 (51.2)", 1)
         .adapted(f"{LATTICE}; the dots have at least 5 % of the brightest")
         .limit_from("the paper's lattice, beyond which this one reaches"),
         above("dots at half the middle's light over the lit print", half_deg / lit_deg, 1.0, LIMITED, 2)
-        .adapted(f"{LATTICE}; the print is lit by a cone that was put in").limit_from("the light ends first"),
-        above("field lit by an LED without its cap, to the rims, degrees", to_rims_deg, 51.2,
-              "mitigated by improving the illumination NA", 1)
-        .adapted("traced; orientation and distances of the lenses are ours").limit_from("the imaging path's 51.2"),
-    )  # fmt: skip
-    shown = (*compared(lit, {"cone of 24.75 degrees": picture}), *compared(wide, {"cone of 30 degrees": wider}),
-             *compared(shining, {"shining dots": dots}))  # fmt: skip
+        .adapted(f"{LATTICE}; the print is lit by a cone that was put in")
+        .limit_from("the light ends first"),
+        above(
+            "field lit by an LED without its cap, to the rims, degrees",
+            to_rims_deg,
+            51.2,
+            "mitigated by improving the illumination NA",
+            1,
+        )
+        .adapted("traced; orientation and distances of the lenses are ours")
+        .limit_from("the imaging path's 51.2"),
+    )
+    shown = (
+        *compared(lit, {"cone of 24.75 degrees": picture}),
+        *compared(wide, {"cone of 30 degrees": wider}),
+        *compared(shining, {"shining dots": dots}),
+    )
     return Outcome(claims, shown, (), (_fields_note(half_deg),))
+
+
+def _cone_claims(lit_deg: float, wide_deg: float, traced_wide_deg: float) -> tuple[Claim, ...]:
+    """Return the claims on the field lit by the paper's cone and by a wider one."""
+    return (
+        within("print lit by a cone of 24.75 degrees, degrees", lit_deg, 32, 34, "33 (33.4)", 1)
+        .put_in("the paper prints no cone: 24.75 is its 33 over f2 / f1")
+        .limit_from("the paper's 33 +- 1"),
+        within(
+            "print lit by a cone of 30 degrees, degrees",
+            wide_deg,
+            round(traced_wide_deg - 1.5, 1),
+            round(traced_wide_deg + 1.5, 1),
+            LIMITED,
+            1,
+        )
+        .adapted("the cone is wider than the paper's; if something else limits the field, it does not grow")
+        .limit_from(f"traced light: {traced_wide_deg:.1f} degrees; +- 1.5, blur and sample at both edges"),
+    )
 
 
 def _fields_note(half_deg: float) -> str:
@@ -310,19 +374,28 @@ def _fields_note(half_deg: float) -> str:
 
 EXPERIMENTS = (
     Experiment(
-        "S3", "A printed ruler, white and black", "Fifteen millimetres with a tick each millimetre, white on black and "
+        "S3",
+        "A printed ruler, white and black",
+        "Fifteen millimetres with a tick each millimetre, white on black and "
         "black on white, with one and the same weight.",
-        "Figure 4b: 15 mm are 33.4 degrees; PCC similar, PSNR and SSIM much reduced on white paper.", run_rulers,
+        "Figure 4b: 15 mm are 33.4 degrees; PCC similar, PSNR and SSIM much reduced on white paper.",
+        run_rulers,
         EVEN,
     ),
     Experiment(
-        "S4", "A printed retina at three places", "The print is moved by 4 mm to either side behind the lens.",
-        "Figure 4c: vessels, haemorrhages and disc are captured at all three places.", run_prints,
+        "S4",
+        "A printed retina at three places",
+        "The print is moved by 4 mm to either side behind the lens.",
+        "Figure 4c: vessels, haemorrhages and disc are captured at all three places.",
+        run_prints,
         f"the print moves behind the lens, not the model eye; the retina is drawn; {EVEN}",
     ),
     Experiment(
-        "S7", "What limits the field", "A print lit by LEDs whose cap leaves a cone of 24.75 or 30 degrees, traced "
+        "S7",
+        "What limits the field",
+        "A print lit by LEDs whose cap leaves a cone of 24.75 or 30 degrees, traced "
         "through the relay, beside shining dots that reach farther than the paper's and the beam walk of T.",
-        "Discussion: \"the current system FOV is limited by the extent of the LED illumination\".", run_fields,
+        'Discussion: "the current system FOV is limited by the extent of the LED illumination".',
+        run_fields,
     ),
-)  # fmt: skip
+)

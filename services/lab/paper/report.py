@@ -14,7 +14,7 @@ from typing import get_args
 
 from device.clock import Clock, SystemClock
 from device.errors import SettingError
-from services.lab.paper import (  # fmt: skip
+from services.lab.paper import (
     caustics,
     first_order,
     hard,
@@ -34,9 +34,27 @@ from services.lab.paper.style import CLAIMED, GLOSSARY, STYLE
 from services.lab.reconstruct_file import write_or_raise
 
 ORDER = (
-    "N", "T", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M",
-    "L", "D",
-)  # fmt: skip
+    "N",
+    "T",
+    "S0",
+    "S1",
+    "S2",
+    "S2b",
+    "S3",
+    "S4",
+    "S5",
+    "S6",
+    "S7",
+    "S8",
+    "S9",
+    "S10",
+    "S11",
+    "S12",
+    "S13",
+    "M",
+    "L",
+    "D",
+)
 LONGEST = ("S13", "D", "L")  # begun first, so that no process is left alone with one of them
 WORKERS = 2  # processes of the whole report: most experiments use one core
 MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
@@ -147,8 +165,10 @@ def table(ran: Sequence[ExperimentRun]) -> str:
     for one in ran:
         for claim in one.outcome.claims:
             mark = MARKS[claim.status]
-            lines.append(f"{one.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
-                         f"{claim.paper}".rstrip())  # fmt: skip
+            lines.append(
+                f"{one.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
+                f"{claim.paper}".rstrip()
+            )
     return "\n".join(lines)
 
 

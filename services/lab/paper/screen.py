@@ -166,15 +166,26 @@ def run_dots(bench: Bench) -> Outcome:
     claims = (
         *_printed_scores(take.score(direct), take.score(after), swept),
         above("rise of PCC by the division, floor 5 % before and after", _rise(swept, "pcc"), 0.0, IMPROVES)
-        .adapted(FLOORED).limit_from("any improvement"),
+        .adapted(FLOORED)
+        .limit_from("any improvement"),
         above("rise of PSNR by the division, floor 5 % before and after, dB", _rise(swept, "psnr_db"), 0.0, IMPROVES, 2)
-        .adapted(FLOORED).limit_from("any improvement"),
-        within("width of the lattice that is found, degrees", (row.max() - row.min()) / take.px_per_deg, 50.2, 52.2,
-               "51.2", 2).put_in(SPANNED).limit_from("51.2 +- 1, a quarter of the distance to the next dot"),
+        .adapted(FLOORED)
+        .limit_from("any improvement"),
+        within(
+            "width of the lattice that is found, degrees",
+            (row.max() - row.min()) / take.px_per_deg,
+            50.2,
+            52.2,
+            "51.2",
+            2,
+        )
+        .put_in(SPANNED)
+        .limit_from("51.2 +- 1, a quarter of the distance to the next dot"),
         below("edge dot over middle dot before", edge_ratio(direct, take), 0.35, "uneven").put_in(PARTLY),
         within("edge dot over middle dot after", edge_ratio(after, take), 0.5, 1.5, "compensated")
-        .adapted(f"computed, but {FALLOFF}").limit_from("1: as bright as the middle; within a factor of two below"),
-    )  # fmt: skip
+        .adapted(f"computed, but {FALLOFF}")
+        .limit_from("1: as bright as the middle; within a factor of two below"),
+    )
     shown = (
         *compared(take, {"direct": direct, "corrected": after}),
         cutline(take, 0.0, {"direct": direct, "corrected": after}, "Along the middle row of dots"),
@@ -188,16 +199,22 @@ def _printed_scores(before: Scores, after: Scores, swept: list[Cell]) -> tuple[C
     bare = next(one for one in swept if one.mu == DOT_MU and one.floor == 0.0)
     near = "the paper's value +- 0.1"
     return (
-        attempted("SSIM of the direct picture", before.ssim, 0.49, 0.69, ".59").adapted(f"{NO_FLOOR}; {FALLOFF}")
+        attempted("SSIM of the direct picture", before.ssim, 0.49, 0.69, ".59")
+        .adapted(f"{NO_FLOOR}; {FALLOFF}")
         .limit_from(near),
         attempted("SSIM of the corrected picture, floor 5 %", after.ssim, 0.75, 0.95, ".85")
-        .adapted(f"{WITH_FLOOR}; without it {bare.after.ssim:.3f}; {FALLOFF}").limit_from(near),
+        .adapted(f"{WITH_FLOOR}; without it {bare.after.ssim:.3f}; {FALLOFF}")
+        .limit_from(near),
         attempted("rise of SSIM by the division, without a floor", bare.after.ssim - before.ssim, 0.16, 0.36, ".26")
-        .because(f"the division lowers SSIM; a floor on the corrected picture only would give "
-                 f"{after.ssim - before.ssim:+.3f}, by the floor and not by the correction").limit_from(near),
+        .because(
+            f"the division lowers SSIM; a floor on the corrected picture only would give "
+            f"{after.ssim - before.ssim:+.3f}, by the floor and not by the correction"
+        )
+        .limit_from(near),
         attempted("rise of SSIM by the division, best of 16 settings", best, 0.16, 0.36, ".26")
-        .because("tried: four weights, four floors, the same before and after (table)").limit_from(near),
-    )  # fmt: skip
+        .because("tried: four weights, four floors, the same before and after (table)")
+        .limit_from(near),
+    )
 
 
 def _rise(swept: list[Cell], score: str) -> float:
@@ -226,24 +243,24 @@ def run_retina(bench: Bench) -> Outcome:
     pictures |= {name: bench.solve(take, method) for name, method in methods.items()}
     harder_mu, harder = bench.best_detail_mu(disc)
     harder_even = disc.flat_field_corrected(harder)
-    asked, same = _edges(take, direct)
-    lesions, seen = spots_followed(take, direct)
     claims = (
-        above("edges on five cutlines with the truth's sign, share", same / max(asked, 1), 0.9,
-              "bright and dark edges are followed"),
-        above("clear edges of the truth on the five cutlines, number", asked, 20, digits=0)
-        .limit_from("so that one edge is at most 5 %"),
-        above("bright and dark spots with the truth's sign, share", seen / max(lesions, 1), 0.75,
-              "major features are captured"),
-        above("bright and dark spots of the truth, number", lesions, 10, digits=0)
-        .limit_from("so that one spot is at most 10 %"),
-        attempted("change of SSIM by the flat field", take.score(even).ssim - take.score(direct).ssim, -1.0, 0.0,
-                  "reduced by loss of contrast")
-        .adapted(f"{DRAWN}; divided inside the outline of the cut picture (note)").limit_from("any reduction"),
+        *_feature_claims(take, direct),
+        attempted(
+            "change of SSIM by the flat field",
+            take.score(even).ssim - take.score(direct).ssim,
+            -1.0,
+            0.0,
+            "reduced by loss of contrast",
+        )
+        .adapted(f"{DRAWN}; divided inside the outline of the cut picture (note)")
+        .limit_from("any reduction"),
         above("PCC of our default", take.score(pictures[DEFAULT]).pcc, 0.9),
-    )  # fmt: skip
-    shown = (*compared(take, pictures), *compared(disc, {f"full disc, paper's, mu {harder_mu:.0e}": harder}),
-             cutline(take, 0.4, _cutline_pictures(pictures), "Across disc and macula"))  # fmt: skip
+    )
+    shown = (
+        *compared(take, pictures),
+        *compared(disc, {f"full disc, paper's, mu {harder_mu:.0e}": harder}),
+        cutline(take, 0.4, _cutline_pictures(pictures), "Across disc and macula"),
+    )
     rows = [_detail_row(name, take.score(x)) for name, x in pictures.items()]
     rows += [
         _detail_row("the truth itself, flat field", take.score(take.flat_field_corrected(take.truth))),
@@ -252,6 +269,32 @@ def run_retina(bench: Bench) -> Outcome:
     ]
     head = ("picture", "PCC", "PSNR, dB", "SSIM", "detail")
     return Outcome(claims, shown, (Table(head, tuple(rows)),), ON_THE_CUT)
+
+
+def _feature_claims(take: SimulatedFrame, picture: Image) -> tuple[Claim, ...]:
+    """Return the claims on edges and spots of the truth that the picture follows."""
+    asked, same = _edges(take, picture)
+    lesions, seen = spots_followed(take, picture)
+    return (
+        above(
+            "edges on five cutlines with the truth's sign, share",
+            same / max(asked, 1),
+            0.9,
+            "bright and dark edges are followed",
+        ),
+        above("clear edges of the truth on the five cutlines, number", asked, 20, digits=0).limit_from(
+            "so that one edge is at most 5 %"
+        ),
+        above(
+            "bright and dark spots with the truth's sign, share",
+            seen / max(lesions, 1),
+            0.75,
+            "major features are captured",
+        ),
+        above("bright and dark spots of the truth, number", lesions, 10, digits=0).limit_from(
+            "so that one spot is at most 10 %"
+        ),
+    )
 
 
 def _detail_row(name: str, scores: Scores) -> tuple[str, ...]:
@@ -278,10 +321,11 @@ def run_flat_screen(bench: Bench) -> Outcome:
     drawn_out = sum(elongation(bad, flat, at) / elongation(good, curved, at) for at in (-NEXT_DEG, NEXT_DEG)) / 2
     claims = (
         below("edge dot over middle dot on the flat screen", edge_ratio(bad, flat), 0.35, "uneven").put_in(PARTLY),
-        above("PCC lost by the flat screen", scores[0].pcc - scores[1].pcc, 0.05, "more blurred, lower contrast")
-        .adapted(f"{NO_NUMBER}; {FALLOFF}, for both screens"),
+        above(
+            "PCC lost by the flat screen", scores[0].pcc - scores[1].pcc, 0.05, "more blurred, lower contrast"
+        ).adapted(f"{NO_NUMBER}; {FALLOFF}, for both screens"),
         above("length over width of edge dots, flat screen over curved", drawn_out, 1.1),
-    )  # fmt: skip
+    )
     shown = (
         *compared(flat, {"flat screen": bad, "curved screen": good}),
         plane("right edge of the flat screen", _edge(bad, flat)),
@@ -301,18 +345,25 @@ def _edge(picture: Image, take: SimulatedFrame) -> Image:
 
 EXPERIMENTS = (
     Experiment(
-        "S1", "Dots on a flat screen", "A lattice of 275 um dots over 51.2 degrees, direct and after the flat field.",
-        "Figure 3b: 51.2 degrees; the flat field raises SSIM from 0.59 to 0.85.", run_dots,
+        "S1",
+        "Dots on a flat screen",
+        "A lattice of 275 um dots over 51.2 degrees, direct and after the flat field.",
+        "Figure 3b: 51.2 degrees; the flat field raises SSIM from 0.59 to 0.85.",
+        run_dots,
     ),
     Experiment(
-        "S2", "A retina on a screen",
+        "S2",
+        "A retina on a screen",
         "A diabetic retina in the shape of the paper's photograph, 48.3 by 34.6 degrees; and the full disc.",
         "Figure 3c: 48.3 degrees; the flat field's loss of contrast lowers SSIM; vessels blurred, edges followed.",
-        run_retina, DRAWN,
+        run_retina,
+        DRAWN,
     ),
     Experiment(
-        "S2b", "The screen is flat", "The same dots on a flat screen behind a single lens, with the walk of the beam.",
-        "Figure 3: \"possibly due to the mismatch between the model curved retina and the flat OLED screen\".",
+        "S2b",
+        "The screen is flat",
+        "The same dots on a flat screen behind a single lens, with the walk of the beam.",
+        'Figure 3: "possibly due to the mismatch between the model curved retina and the flat OLED screen".',
         run_flat_screen,
     ),
-)  # fmt: skip
+)

@@ -12,11 +12,15 @@ from services.lab.paper.pictures import compared, trend
 PAPER_PITCH_UM, PAPER_PEAK_E = 5.04, 20000.0
 SLACK = 0.01  # tolerance of a PCC below the measured one
 SENSORS: dict[str, tuple[int, int, float, int]] = {  # rows, cols, pitch in um, n x n pixels combined
-    "IMX296": (1088, 1456, 3.45, 1), "IMX477": (3040, 4056, 1.55, 3), "OV9281": (800, 1280, 3.0, 1),
-}  # fmt: skip
+    "IMX296": (1088, 1456, 3.45, 1),
+    "IMX477": (3040, 4056, 1.55, 3),
+    "OV9281": (800, 1280, 3.0, 1),
+}
 SEEN = {  # measured PCC of this retina, the smaller of full and merged pixels: `evidence`, our default
-    "IMX296": (0.910, 0.961), "IMX477": (0.937, 0.958), "OV9281": (0.805, 0.921),
-}  # fmt: skip
+    "IMX296": (0.910, 0.961),
+    "IMX477": (0.937, 0.958),
+    "OV9281": (0.805, 0.921),
+}
 TOO_SMALL = ("OV9281",)  # for the PSF itself: 3.4 mm wide on a side of 2.4 mm
 EYES = 6
 FUTURE = "an outlook of the paper, which shows no refraction"
@@ -32,10 +36,14 @@ def camera(name: str, coarse: bool) -> HeadChanges:
     n = round(SAMPLE_UM / pitch_um) if coarse else n
     peak_e = PAPER_PEAK_E * (pitch_um * n / PAPER_PITCH_UM) ** 2
     return {
-        "camera.rows": rows // n, "camera.cols": cols // n, "camera.pitch_um": pitch_um * n,
-        "camera.full_well_e": 1.2 * peak_e, "camera.read_noise_e": 2.0 * n, "sim.peak_e": peak_e,
+        "camera.rows": rows // n,
+        "camera.cols": cols // n,
+        "camera.pitch_um": pitch_um * n,
+        "camera.full_well_e": 1.2 * peak_e,
+        "camera.read_noise_e": 2.0 * n,
+        "sim.peak_e": peak_e,
         "sim.calibration.source_um": 0.0,
-    }  # fmt: skip
+    }
 
 
 def whole_psf(bench: Bench, take: SimulatedFrame, name: str, coarse: bool) -> SimulatedFrame:
@@ -98,9 +106,14 @@ def run_refraction(bench: Bench) -> Outcome:
     claims.append(below("J0 and J45 of all eyes, rms error, dpt", rms(cylinders), 0.15).ours(FUTURE))
     curve = {kind: dict(zip(eyes[:, 0].tolist(), error[:, 0].tolist(), strict=True)) for kind, error in errors.items()}
     shown = (
-        trend("Error of the refraction that the frame tells", "no beacon; wavefront M", "M of the eye, dpt",
-              "found less true, dpt", curve),
-    )  # fmt: skip
+        trend(
+            "Error of the refraction that the frame tells",
+            "no beacon; wavefront M",
+            "M of the eye, dpt",
+            "found less true, dpt",
+            curve,
+        ),
+    )
     rows = tuple(
         (*(f"{value:+.2f}" for value in eye), *(" ".join(f"{value:+.2f}" for value in one) for one in estimates))
         for eye, *estimates in zip(eyes, *found.values(), strict=True)
@@ -131,15 +144,19 @@ def rms(values: NDArray[np.float64]) -> float:
 
 EXPERIMENTS = (
     Experiment(
-        "S10", "Sensors that are too small", "The paper's optics before three cheap sensors, in the same light.",
-        "\"One needs to choose an image sensor size D > d + 2s.\"", run_sensors,
+        "S10",
+        "Sensors that are too small",
+        "The paper's optics before three cheap sensors, in the same light.",
+        '"One needs to choose an image sensor size D > d + 2s."',
+        run_sensors,
     ),
     Experiment(
-        "S11", "Refraction from the frame",
+        "S11",
+        "Refraction from the frame",
         "The refraction of six random eyes, without astigmatism (round: J0 = J45 = 0) and with it, estimated from the "
         "stretch of the caustic in the fundus frame alone. M is the mean sphere; J0 and J45 are the two parts "
         "of the cylinder.",
-        "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".",
+        'Abstract: "this technology could enable combined ocular aberrometry and funduscopic screening".',
         run_refraction,
     ),
-)  # fmt: skip
+)

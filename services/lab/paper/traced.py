@@ -88,9 +88,14 @@ def run_trace(bench: Bench) -> Outcome:
     shares = {float(angle): relay.lit_share(angle) for angle in range(20, 33)}
     shown = (
         _drawing(relay, path),
-        trend("The beam leaves the iris", "share of the iris's area that a beam lights, traced", "field angle, degrees",
-              "share lit", {"traced": shares, "paper": {15.0: 1.0, 25.0: 1.0, 30.0: 0.063}}),
-    )  # fmt: skip
+        trend(
+            "The beam leaves the iris",
+            "share of the iris's area that a beam lights, traced",
+            "field angle, degrees",
+            "share lit",
+            {"traced": shares, "paper": {15.0: 1.0, 25.0: 1.0, 30.0: 0.063}},
+        ),
+    )
     return Outcome(claims, shown, (_table(relay, path),), (*NOTES, _far_eye_note(path)))
 
 
@@ -102,10 +107,16 @@ def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
         attempted("second pair to iris, mm", relay.iris_at_mm - relay.lamp_surfaces[-1].at_mm, 40, 45, "> 40", 2)
         .because("40.0 without the gap of 1 mm, which is ours, as is the plate's thickness")
         .limit_from("the paper's least"),
-        below("walk of the beam at 15 degrees over the margin around the iris", relay.walk_mm(15) / margin_mm, 0.25,
-              "no shift within 15 degrees", 2).adapted(
+        below(
+            "walk of the beam at 15 degrees over the margin around the iris",
+            relay.walk_mm(15) / margin_mm,
+            0.25,
+            "no shift within 15 degrees",
+            2,
+        ).adapted(
             f"the beam moves by {relay.walk_mm(15):.2f} mm where the paper says without shift; read as: a shift that "
-            f"the margin around the iris hides; {LAYOUT}"),
+            f"the margin around the iris hides; {LAYOUT}"
+        ),
         above("share of the iris lit at 25 degrees", relay.lit_share(25), 0.999, "fully illuminated", 4).limit_from(
             "fully: all but one point of 4000"
         ),
@@ -114,14 +125,18 @@ def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
         .adapted(GUESSED)
         .limit_from(f"95 % of {DRAWS} relays drawn within tolerances are filled up to an angle between these"),
         attempted("share of the iris lit at 30 degrees", relay.lit_share(30), 0.053, 0.073, "6.3 %", 3)
-        .because(f"the nominal layout is ours; an eye {OFF_MM:g} mm farther off, a distance chosen for that, gives "
-                 "about 6.3 %")
+        .because(
+            f"the nominal layout is ours; an eye {OFF_MM:g} mm farther off, a distance chosen for that, gives "
+            "about 6.3 %"
+        )
         .limit_from("the paper's value +- 0.01"),
-        within("6.3 % of the iris lit at 30 degrees, among built relays", 0.063, *built.lit_at_30,
-               "6.3 %", 3).adapted(GUESSED).limit_from(
-            f"95 % of {DRAWS} relays drawn within tolerances: from almost no light to half of it, so a weak test"),
+        within("6.3 % of the iris lit at 30 degrees, among built relays", 0.063, *built.lit_at_30, "6.3 %", 3)
+        .adapted(GUESSED)
+        .limit_from(
+            f"95 % of {DRAWS} relays drawn within tolerances: from almost no light to half of it, so a weak test"
+        ),
         *_displacements(relay),
-    )  # fmt: skip
+    )
 
 
 def _displacements(relay: TracedRelay) -> tuple[Claim, ...]:
@@ -129,25 +144,38 @@ def _displacements(relay: TracedRelay) -> tuple[Claim, ...]:
     over_formula, over_ideal = displacement_error(relay, 25)
     linear, tangent = f_theta_error(relay, 25)
     return (
-        within("traced displacement over s = (f1/f2) f_d theta/2, at 25 degrees", 1 + over_formula, 0.95, 1.05,
-               "approximately d + 2s", 4).adapted(f"read as: within 5 %; {LAYOUT}"),
+        within(
+            "traced displacement over s = (f1/f2) f_d theta/2, at 25 degrees",
+            1 + over_formula,
+            0.95,
+            1.05,
+            "approximately d + 2s",
+            4,
+        ).adapted(f"read as: within 5 %; {LAYOUT}"),
         within("traced displacement over that of an ideal relay, at 25 degrees", 1 + over_ideal, 0.95, 1.0, "", 4),
         below("angle behind the relay at 25 degrees, off a linear law", abs(linear), 0.01, "", 4),
         above("angle behind the relay at 25 degrees, off the tangent's law", abs(tangent), 0.02, "", 4),
-    )  # fmt: skip
+    )
 
 
 def _eye(path: LightPath) -> tuple[Claim, ...]:
     curved, flat = retina_point(path, 25), retina_point(path, 25, inf)
     strongest = max(abs(curved.sagittal_dpt), abs(curved.tangential_dpt))
     return (
-        below("vergence of a beam at 25 degrees, curved retina, dpt", strongest, 4.0, "collimated from any spot",
-              2).adapted("read as: within the 4 dpt that the paper tolerates; the distance from pupil to lens is ours")
+        below("vergence of a beam at 25 degrees, curved retina, dpt", strongest, 4.0, "collimated from any spot", 2)
+        .adapted("read as: within the 4 dpt that the paper tolerates; the distance from pupil to lens is ours")
         .limit_from("the 4 dpt that the paper tolerates"),
-        above("vergence at 25 degrees, flat screen over curved retina", flat.tangential_dpt / strongest, 2.0,
-              "mismatch of a flat screen", 2).adapted("the paper names the mismatch as a possible cause, without a "
-                                                      "number; the distance from pupil to lens is ours"),
-    )  # fmt: skip
+        above(
+            "vergence at 25 degrees, flat screen over curved retina",
+            flat.tangential_dpt / strongest,
+            2.0,
+            "mismatch of a flat screen",
+            2,
+        ).adapted(
+            "the paper names the mismatch as a possible cause, without a "
+            "number; the distance from pupil to lens is ours"
+        ),
+    )
 
 
 def _illumination(relay: TracedRelay) -> tuple[Claim, ...]:
@@ -160,23 +188,37 @@ def _illumination(relay: TracedRelay) -> tuple[Claim, ...]:
         within("ring of 9.5 mm at the pupil, mm", ring_mm, 6.9, 7.7, "approximately the pupil, 7.7", 2)
         .adapted(f"read as: up to a tenth smaller than the pupil, so that it enters; {LAYOUT}")
         .limit_from("the pupil's 7.7, less a tenth"),
-    )  # fmt: skip
+    )
 
 
 def _table(relay: TracedRelay, path: LightPath) -> Table:
     rows = []
     for angle in (5, 10, 15, 20, 25, 28, 30):
         point, screen = retina_point(path, angle), retina_point(path, angle, inf)
-        rows.append((
-            f"{angle}", f"{relay.walk_mm(angle):.2f}", f"{relay.lit_share(angle):.3f}",
-            f"{relay.passed_share(angle) / relay.passed_share(0):.2f}", f"{relay.angle_behind_deg(angle):.2f}",
-            f"{100 * f_theta_error(relay, angle)[0]:+.2f}", f"{100 * displacement_error(relay, angle)[0]:+.1f}",
-            f"{point.sagittal_dpt:+.1f}, {point.tangential_dpt:+.1f}",
-            f"{screen.sagittal_dpt:+.1f}, {screen.tangential_dpt:+.1f}",
-        ))  # fmt: skip
-    head = ("field angle, degrees", "beam walk, mm", "iris lit", "light past all rims", "angle behind the relay",
-            "angle off a linear law, %", "displacement off the formula, %",
-            "vergence on R 14 mm, sag., tan., dpt", "on a flat screen")  # fmt: skip
+        rows.append(
+            (
+                f"{angle}",
+                f"{relay.walk_mm(angle):.2f}",
+                f"{relay.lit_share(angle):.3f}",
+                f"{relay.passed_share(angle) / relay.passed_share(0):.2f}",
+                f"{relay.angle_behind_deg(angle):.2f}",
+                f"{100 * f_theta_error(relay, angle)[0]:+.2f}",
+                f"{100 * displacement_error(relay, angle)[0]:+.1f}",
+                f"{point.sagittal_dpt:+.1f}, {point.tangential_dpt:+.1f}",
+                f"{screen.sagittal_dpt:+.1f}, {screen.tangential_dpt:+.1f}",
+            )
+        )
+    head = (
+        "field angle, degrees",
+        "beam walk, mm",
+        "iris lit",
+        "light past all rims",
+        "angle behind the relay",
+        "angle off a linear law, %",
+        "displacement off the formula, %",
+        "vergence on R 14 mm, sag., tan., dpt",
+        "on a flat screen",
+    )
     return Table(head, tuple(rows))
 
 
@@ -198,13 +240,17 @@ def _drawing(relay: TracedRelay, path: LightPath) -> Figure:
         inner.append(f'<g class="{kind}">{lines}</g>')
     words = "; ".join(f"{angle:g}" for angle in DRAWN_DEG)
     caption = f"The traced relay to scale: beams of {words} degrees from the pupil to the iris"
-    style = STYLE + (".ray { fill: none; stroke: var(--ink); stroke-width: 1; opacity: .8; }"
-                     ".stop { stroke: #8a8f98; stroke-width: 3; }"
-                     ".glass { fill: none; stroke: #4a6b8a; stroke-width: 1.5; }")  # fmt: skip
-    drawn = (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {TALL}" width="{WIDE}" height="{TALL}" '
-             f'role="img"><title>{caption}</title><style>{style}</style>'
-             f'<rect class="ground" width="{WIDE}" height="{TALL}"/>{text(24, 28, caption, "title")}'
-             f'{"".join(inner)}</svg>')  # fmt: skip
+    style = STYLE + (
+        ".ray { fill: none; stroke: var(--ink); stroke-width: 1; opacity: .8; }"
+        ".stop { stroke: #8a8f98; stroke-width: 3; }"
+        ".glass { fill: none; stroke: #4a6b8a; stroke-width: 1.5; }"
+    )
+    drawn = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {TALL}" width="{WIDE}" height="{TALL}" '
+        f'role="img"><title>{caption}</title><style>{style}</style>'
+        f'<rect class="ground" width="{WIDE}" height="{TALL}"/>{text(24, 28, caption, "title")}'
+        f"{''.join(inner)}</svg>"
+    )
     return Figure(caption, f"data:image/svg+xml;base64,{b64encode(drawn.encode()).decode()}", wide=True)
 
 
@@ -222,9 +268,11 @@ def _points(places: np.ndarray) -> str:
 
 EXPERIMENTS = (
     Experiment(
-        "T", "The real lenses, traced", "Rays through LB1761-A, 2 x AC508-075-A, 2 x AC508-100-A and the plate, from "
-        "the makers' radii and glasses.",
-        "Figure 2 (Zemax): no shift within 15 degrees, iris filled to 25, 6.3 % of its area lit at 30.", run_trace,
+        "T",
+        "The real lenses, traced",
+        "Rays through LB1761-A, 2 x AC508-075-A, 2 x AC508-100-A and the plate, from the makers' radii and glasses.",
+        "Figure 2 (Zemax): no shift within 15 degrees, iris filled to 25, 6.3 % of its area lit at 30.",
+        run_trace,
         LAYOUT,
     ),
-)  # fmt: skip
+)

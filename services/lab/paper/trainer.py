@@ -10,7 +10,7 @@ from device.recon.assessment.metrics import highpass
 from device.recon.estimation.psf_warp import transform, warped
 from device.values import Image
 from services.lab.paper.bench import DETAIL_DEG, SCHEDULE, Bench, SimulatedFrame
-from services.lab.paper.outcome import Claim, Experiment, Outcome, Table, above, below, within
+from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, below, within
 from services.lab.paper.pictures import compared, cutline, psf_cutlines, trend
 
 EYES_DPT = (-4.0, -2.0, 0.0, 2.0, 4.0)
@@ -121,10 +121,16 @@ def run_eyes(bench: Bench) -> Outcome:
         if m_dpt in (-4.0, 4.0):
             pictures[f"eye of {m_dpt:+g} dpt, PSF of 0 dpt"] = paper
     shown = (
-        *compared(relaxed, pictures), cutline(relaxed, 0.4, pictures, "Across the disc"),
-        trend("Likeness to the truth over the eye's refraction", f"275 um dot as PSF, mu {mu:.0e} at rest",
-              "wavefront M of the eye, dpt", "PCC", eyes.lines),
-    )  # fmt: skip
+        *compared(relaxed, pictures),
+        cutline(relaxed, 0.4, pictures, "Across the disc"),
+        trend(
+            "Likeness to the truth over the eye's refraction",
+            f"275 um dot as PSF, mu {mu:.0e} at rest",
+            "wavefront M of the eye, dpt",
+            "PCC",
+            eyes.lines,
+        ),
+    )
     note = (
         "The paper explains the tolerance by lenslets with a large depth of focus. The simulator has it without them: "
         "there the blur is the ordinary blur circle, 0.55 degrees at 4 dpt, and the resolution is about 0.6 degrees "
@@ -138,14 +144,25 @@ def run_eyes(bench: Bench) -> Outcome:
 def _paper_eyes(eyes: Eyes, at_rest: float, sizes: Sequence[float]) -> tuple[Claim, ...]:
     worst = min(eyes.paper[-4.0], eyes.paper[4.0]) / at_rest
     return (
-        above("PCC at 4 dpt over PCC at rest, paper's solver", worst, 1 - LOST_AT_4_DPT, "no significant degradation")
-        .adapted(f"not significant read as: at most {100 * LOST_AT_4_DPT:.0f} % of PCC, less than the 11 % between "
-                 f"the positions of one print (S4); {ADAPTED}"),
-        below("change of magnification within 4 dpt, paper's solver", _largest_change(sizes), 0.003,
-              "invariant magnification", 4)
-        .adapted(f"that the optics keep the angle of a point is put in; tested is that the PSF of 0 dpt adds no change "
-                 f"to the picture; {ADAPTED}").limit_from("a third of a sample at 12 degrees from the axis"),
-    )  # fmt: skip
+        above(
+            "PCC at 4 dpt over PCC at rest, paper's solver", worst, 1 - LOST_AT_4_DPT, "no significant degradation"
+        ).adapted(
+            f"not significant read as: at most {100 * LOST_AT_4_DPT:.0f} % of PCC, less than the 11 % between "
+            f"the positions of one print (S4); {ADAPTED}"
+        ),
+        below(
+            "change of magnification within 4 dpt, paper's solver",
+            _largest_change(sizes),
+            0.003,
+            "invariant magnification",
+            4,
+        )
+        .adapted(
+            f"that the optics keep the angle of a point is put in; tested is that the PSF of 0 dpt adds no change "
+            f"to the picture; {ADAPTED}"
+        )
+        .limit_from("a third of a sample at 12 degrees from the axis"),
+    )
 
 
 def _own_eyes(eyes: Eyes, sizes: Sequence[float]) -> tuple[Claim, ...]:
@@ -153,10 +170,11 @@ def _own_eyes(eyes: Eyes, sizes: Sequence[float]) -> tuple[Claim, ...]:
     return (
         below("change of magnification within 4 dpt, flat-sub", _largest_change(sizes), 0.003, "", 4),
         below("PCC lost within 4 dpt, the default schedule", lost, 0.01, "", 4),
-        below("error of its refraction, in its own sd, worst eye", max(map(abs, eyes.off_sd.values())), 3.0, "", 1)
-        .limit_from("three standard deviations"),
+        below(
+            "error of its refraction, in its own sd, worst eye", max(map(abs, eyes.off_sd.values())), 3.0, "", 1
+        ).limit_from("three standard deviations"),
         below("PCC lost at 4 dpt with the stretched PSF, flat-sub", lost_flat, 0.005, "", 4),
-    )  # fmt: skip
+    )
 
 
 def _largest_change(sizes: Sequence[float]) -> float:
@@ -182,24 +200,35 @@ def run_psfs(bench: Bench) -> Outcome:
             pictures[f"PSF of M = {m_dpt:+.1f} dpt"] = picture
         if m_dpt in (PSFS_DPT[0], 0.0, PSFS_DPT[-1]):
             points[f"M = {m_dpt:+.1f} dpt"] = take.calibration.psfs[0].pixels
-    restored = max(back[0.0] - back[m] for m in PSFS_DPT)
     claims = (
         *_paper_psfs(paper),
         below("PCC lost, worst PSF, the default schedule", shipped[0.0] - min(shipped.values()), 0.01, "", 4),
-        below("error of its refraction, in its own sd, worst PSF", max(map(abs, off_sd.values())), 3.0, "", 1)
-        .limit_from("three standard deviations"),
-        above("least PCC lost from a PSF to the next farther off, flat-sub", min(_losses(flat, FARTHER_DPT)), 0.0)
-        .limit_from("monotone"),
-        below("PCC lost with the PSF stretched back, paper's solver", restored, 0.01, "", 4).ours(SCREENS),
-    )  # fmt: skip
+        below(
+            "error of its refraction, in its own sd, worst PSF", max(map(abs, off_sd.values())), 3.0, "", 1
+        ).limit_from("three standard deviations"),
+        above(
+            "least PCC lost from a PSF to the next farther off, flat-sub", min(_losses(flat, FARTHER_DPT)), 0.0
+        ).limit_from("monotone"),
+        below("PCC lost with the PSF stretched back, paper's solver", back[0.0] - min(back.values()), 0.01, "", 4).ours(
+            SCREENS
+        ),
+    )
     shown = (
         *compared(take, pictures),
         psf_cutlines(points, IRIS_PX // bench.merged, "The aberrated PSFs (figure 5c)"),
-        trend("Likeness to the truth over the PSF's refraction", "a relaxed eye; stretched back: the paper's solver",
-              "wavefront M of the PSF's eye, dpt", "PCC",
-              {"paper's solver": paper, "stretched back": back, "flat-sub": flat, SCHEDULE: shipped}),
-    )  # fmt: skip
+        _likeness({"paper's solver": paper, "stretched back": back, "flat-sub": flat, SCHEDULE: shipped}),
+    )
     return Outcome(claims, shown, (), (SIGNS, MONOTONE_NOTE))
+
+
+def _likeness(pcc: dict[str, dict[float, float]]) -> Figure:
+    return trend(
+        "Likeness to the truth over the PSF's refraction",
+        "a relaxed eye; stretched back: the paper's solver",
+        "wavefront M of the PSF's eye, dpt",
+        "PCC",
+        pcc,
+    )
 
 
 def _paper_psfs(pcc: dict[float, float]) -> tuple[Claim, ...]:
@@ -208,15 +237,25 @@ def _paper_psfs(pcc: dict[float, float]) -> tuple[Claim, ...]:
     places = (("29 mm (Rx -5.5)", PSFS_DPT[-1]), ("21 mm (Rx +7.6)", PSFS_DPT[0]))
     early = max((pcc[0.0] - pcc[near]) / (pcc[0.0] - pcc[far]) for near, far in EXTREMES_DPT)
     return (
-        *(above(f"PCC over PCC at rest, PSF at {where}, paper's solver", pcc[m_dpt] / pcc[0.0], _slight(m_dpt), quote)
-          .adapted(f"slight read as: PCC at most {100 - 100 * _slight(m_dpt):.1f} % lower, which is "
-                   f"{100 * LOST_AT_4_DPT:.0f} % for each 4 dpt as in S5; {ADAPTED}") for where, m_dpt in places),
-        above("least PCC lost from 4 dpt to the extreme PSFs, paper's solver", min(_losses(pcc, EXTREMES_DPT)), 0.0,
-              quote).adapted(f"read as: a further loss of PCC beyond 4 dpt; {ADAPTED}").limit_from("any degradation"),
+        *(
+            above(
+                f"PCC over PCC at rest, PSF at {where}, paper's solver", pcc[m_dpt] / pcc[0.0], _slight(m_dpt), quote
+            ).adapted(
+                f"slight read as: PCC at most {100 - 100 * _slight(m_dpt):.1f} % lower, which is "
+                f"{100 * LOST_AT_4_DPT:.0f} % for each 4 dpt as in S5; {ADAPTED}"
+            )
+            for where, m_dpt in places
+        ),
+        above(
+            "least PCC lost from 4 dpt to the extreme PSFs, paper's solver", min(_losses(pcc, EXTREMES_DPT)), 0.0, quote
+        )
+        .adapted(f"read as: a further loss of PCC beyond 4 dpt; {ADAPTED}")
+        .limit_from("any degradation"),
         below("share of the extreme PSFs' lost PCC that is lost at 4 dpt", early, NEVER_BEFORE, before)
-        .as_attempt().because("by PCC the degradation begins nearer to rest; a person may see it later")
+        .as_attempt()
+        .because("by PCC the degradation begins nearer to rest; a person may see it later")
         .limit_from("begins at the extremes: a tenth of it before, our reading"),
-    )  # fmt: skip
+    )
 
 
 def _slight(m_dpt: float) -> float:
@@ -251,18 +290,27 @@ def run_distance(bench: Bench) -> Outcome:
 
 EXPERIMENTS = (
     Experiment(
-        "S5", "Eyes out of focus, PSF at rest",
+        "S5",
+        "Eyes out of focus, PSF at rest",
         "Frames of an eye from -4 to +4 dpt are solved with the one PSF of 0 dpt.",
-        "Figure 5b; \"no significant degradation of image quality\" within 4 dpt.", run_eyes, ADAPTED,
+        'Figure 5b; "no significant degradation of image quality" within 4 dpt.',
+        run_eyes,
+        ADAPTED,
     ),
     Experiment(
-        "S6", "PSFs out of focus, eye at rest",
+        "S6",
+        "PSFs out of focus, eye at rest",
         "The frame of a relaxed eye is solved with PSFs of screens up to 4 mm too near and too far.",
-        "Figure 5c; \"slight degradation\" at -5.5 and +7.6 dpt.", run_psfs, ADAPTED,
+        'Figure 5c; "slight degradation" at -5.5 and +7.6 dpt.',
+        run_psfs,
+        ADAPTED,
     ),
     Experiment(
-        "S9", "The sensor half a millimetre farther", "The PSF was taken at 6.0 mm, the frame at 6.5 mm.",
-        f"Section \"Optical design\": \"{NOT_REQUIRED}\" of the distance from diffuser to sensor.", run_distance,
+        "S9",
+        "The sensor half a millimetre farther",
+        "The PSF was taken at 6.0 mm, the frame at 6.5 mm.",
+        f'Section "Optical design": "{NOT_REQUIRED}" of the distance from diffuser to sensor.',
+        run_distance,
         "the paper prints no number: half a millimetre and a PCC within 0.005 are ours; a drawn retina",
     ),
-)  # fmt: skip
+)

@@ -3,9 +3,15 @@
 from pathlib import Path
 
 NAMES = (
-    "own_raw_and_psf", "calibration", "wrong_refraction", "cropped_sensor", "hard_case", "frontier", "own_solver",
+    "own_raw_and_psf",
+    "calibration",
+    "wrong_refraction",
+    "cropped_sensor",
+    "hard_case",
+    "frontier",
+    "own_solver",
     "own_effect",
-)  # fmt: skip
+)
 
 
 def order(file: str) -> int:

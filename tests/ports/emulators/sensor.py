@@ -88,11 +88,13 @@ class Sensor:
         counts = self.world.sensor.read(self._electrons(begin_s, end_s), (self.world.scene.seed, self.frames), None)
         self._write(counts, fd, stream)
         return {
-            "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": self.lowest_gain,
+            "SensorTimestamp": int(end_s * 1e9),
+            "ExposureTime": exposure_us,
+            "AnalogueGain": self.lowest_gain,
             "DigitalGain": 1.0,
             "FrameDuration": int((self._free_s - begin_s) * 1e6),
             "SensorBlackLevels": (int(self.world.spec.camera.black_dn) << (SHARE_16 - self.bits),) * 4,
-        }  # fmt: skip
+        }
 
     def _electrons(self, begin_s: float, end_s: float) -> np.ndarray:
         world = self.world

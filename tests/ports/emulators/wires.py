@@ -18,11 +18,23 @@ COLOURS = ("red", "green", "blue")
 FULL = 255
 SINKS = SinkSpec(  # the ring of imx296_power.toml on the second bus, with 60 mA an output and red LEDs, not amber
     device="/dev/spidev1.0",
-    green=SinkLedSpec(part="green", places=(37, 20, 26, 43), outputs=((0, 1), (3, 4), (6, 7), (9, 10)),
-                      wavelength_um=0.525, power_mw=60, emitter_mm=1.0),
-    red=SinkLedSpec(part="red", places=(29, 19, 34, 44), outputs=((2,), (5,), (8,), (11,)),
-                    wavelength_um=0.622, power_mw=15, emitter_mm=1.0),
-)  # fmt: skip
+    green=SinkLedSpec(
+        part="green",
+        places=(37, 20, 26, 43),
+        outputs=((0, 1), (3, 4), (6, 7), (9, 10)),
+        wavelength_um=0.525,
+        power_mw=60,
+        emitter_mm=1.0,
+    ),
+    red=SinkLedSpec(
+        part="red",
+        places=(29, 19, 34, 44),
+        outputs=((2,), (5,), (8,), (11,)),
+        wavelength_um=0.622,
+        power_mw=15,
+        emitter_mm=1.0,
+    ),
+)
 
 
 class LoggedChain:

@@ -19,9 +19,12 @@ VALUES = {
     "visits": "person, day, begun_at, finished_at, outcome, sent, request",
 }
 PARTS = {  # table of values of a record: table of the record, column with the key of the record
-    "files": ("captures", "capture_id"), "identifiers": ("persons", "person"), "fields": ("visits", "visit"),
-    "slots": ("visits", "visit"), "sendings": ("visits", "visit"),
-}  # fmt: skip
+    "files": ("captures", "capture_id"),
+    "identifiers": ("persons", "person"),
+    "fields": ("visits", "visit"),
+    "slots": ("visits", "visit"),
+    "sendings": ("visits", "visit"),
+}
 CORRECTION = "UPDATE OF eye, report ON captures"  # the revision of its visit shows that a capture was corrected
 
 

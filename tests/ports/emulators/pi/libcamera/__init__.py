@@ -28,11 +28,30 @@ from libcamera._libcamera import (
 )
 
 __all__ = [
-    "Camera", "CameraConfiguration", "CameraManager", "ColorSpace", "ControlInfo", "ControlType", "FrameBuffer",
-    "FrameBufferAllocator", "FrameMetadata", "Orientation", "PixelFormat", "Rectangle", "Request",
-    "SensorConfiguration", "Size", "StreamConfiguration", "StreamFormats", "StreamRole", "Transform", "_libcamera",
-    "controls", "plugged", "properties",
-]  # fmt: skip
+    "Camera",
+    "CameraConfiguration",
+    "CameraManager",
+    "ColorSpace",
+    "ControlInfo",
+    "ControlType",
+    "FrameBuffer",
+    "FrameBufferAllocator",
+    "FrameMetadata",
+    "Orientation",
+    "PixelFormat",
+    "Rectangle",
+    "Request",
+    "SensorConfiguration",
+    "Size",
+    "StreamConfiguration",
+    "StreamFormats",
+    "StreamRole",
+    "Transform",
+    "_libcamera",
+    "controls",
+    "plugged",
+    "properties",
+]
 
 plugged = []
 
@@ -94,9 +113,12 @@ class Camera:
     def properties(self):
         arrangement = properties.draft.ColorFilterArrangementEnum(self.sensor.arrangement)
         return {
-            properties.Model: self.sensor.model, properties.Location: 2, properties.Rotation: 0,
-            properties.PixelArraySize: self.sensor.size, properties.ColorFilterArrangement: arrangement,
-        }  # fmt: skip
+            properties.Model: self.sensor.model,
+            properties.Location: 2,
+            properties.Rotation: 0,
+            properties.PixelArraySize: self.sensor.size,
+            properties.ColorFilterArrangement: arrangement,
+        }
 
     @property
     def controls(self):
