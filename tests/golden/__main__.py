@@ -11,7 +11,6 @@ from pathlib import Path
 
 from tests.golden import (
     bus,
-    collected_tests,
     command_line,
     error_codes,
     exam,
@@ -26,7 +25,6 @@ RECORDS: dict[str, Callable[[], Path]] = {
     "http": http_transcript.write,
     "cli": command_line.write,
     "errors": error_codes.write,
-    "tests": collected_tests.write,
     "scenes": scenes.write,
     "reconstructions": reconstructions.write,
     "exam": exam.write,
