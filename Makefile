@@ -136,7 +136,7 @@ test-light: .venv/ready ## Run a thousand random sequences of presses, aiming an
 	@$(BIN)/python -m tests.property.light_sequences $(N)
 
 # An environment of its own: pyfftw imports dask.array wherever Dask is installed, 0.3 s in every process.
-ARCHIVE_LOCK := services/lab/archive/requirements.lock
+ARCHIVE_LOCK := services/archive/requirements.lock
 
 .archive-venv/ready: $(ARCHIVE_LOCK) pyproject.toml | $(UV)
 	@echo "Setting up .archive-venv (a minute, once)"
@@ -294,7 +294,7 @@ test-parts: .parts-venv/ready ## Measure the printed parts: closed, thick enough
 	@.parts-venv/bin/python -m pytest tests/parts
 
 # Sphinx and matplotlib are needed by the documentation only: an environment of its own.
-SITE_LOCK := services/lab/site/requirements.lock
+SITE_LOCK := services/research/site/requirements.lock
 
 .site-venv/ready: $(SITE_LOCK) pyproject.toml | $(UV)
 	@echo "Setting up .site-venv (a minute, once)"
@@ -304,7 +304,7 @@ SITE_LOCK := services/lab/site/requirements.lock
 	@touch $@
 
 site: .site-venv/ready ## Build the documentation with its gallery into out/site; GALLERY=0 leaves the scripts unrun.
-	@services/lab/site/build
+	@services/research/site/build
 
 test-site: .venv/ready browser site ## Build the documentation, then test its links, its search and the snippets of its pages.
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m site tests/documentation

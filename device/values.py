@@ -295,7 +295,7 @@ class Report:
     """Report of a reconstruction; its fields are the keys of `report.json`.
 
     Units are in the names; a name without a unit is a ratio. The keys inside of the mappings, and the JSON schema, are
-    in `services/lab/report_schema.py`, which takes the descriptions of the fields from here.
+    in `services/research/report_schema.py`, which takes the descriptions of the fields from here.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, bool]] = {"use_attribute_docstrings": True}

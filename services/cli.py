@@ -2,8 +2,8 @@
 
 import json
 import os
+import subprocess
 import sys
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, get_args
@@ -12,31 +12,31 @@ import typer
 
 from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
-from device.errors import DiffuscopeError
+from device.errors import DiffuscopeError, SettingError
 from device.head import probe, recording_spec
 from device.recon.installed_methods import available_methods
 from device.recon.methods import DEFAULT
 from device.recon.model.grid import Grid
 from device.values import Colour
 from services import resources
+from services.archive import command as archive_command
 from services.backup import command as backup_command
-from services.lab import calibration_archive
-from services.lab.archive import command as archive_command
-from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
-from services.lab.datasets import open_dataset
-from services.lab.montage_files import montage_files, placed_lines
-from services.lab.named_files import head_file, scene_file
-from services.lab.peers import ENVIRONMENT, installed_peer
-from services.lab.psf_stack import psf_stack
-from services.lab.reconstruct_burst import reconstruct_burst
-from services.lab.reconstruct_colour import reconstruct_colours
-from services.lab.reconstruct_each import reconstruct_each
-from services.lab.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
-from services.lab.reconstruct_inputs import ReconstructOptions
-from services.lab.running_time import working
 from services.records.command import app as snapshots
 from services.records.store_command import app as store
+from services.research.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
+from services.research.datasets import open_dataset
+from services.research.montage_files import montage_files, placed_lines
+from services.research.named_files import head_file, scene_file
+from services.research.peers import ENVIRONMENT, installed_peer
+from services.research.psf_stack import psf_stack
+from services.research.reconstruct_burst import reconstruct_burst
+from services.research.reconstruct_colour import reconstruct_colours
+from services.research.reconstruct_each import reconstruct_each
+from services.research.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
+from services.research.reconstruct_inputs import ReconstructOptions
+from services.running_time import working
 from services.update.command import app as update_app
+from services.workshop import calibration_archive
 
 app = typer.Typer(
     name="diffuscope",
@@ -96,8 +96,8 @@ def run(
     from services.delivery.uploader import HttpsUploader, load_settings
     from services.http.server import base_url, bind_socket, inherited_socket, serve  # web stack: this command only
     from services.instrument.watchdog import Watchdog
-    from services.lab.frontier import measure_scene
     from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
+    from services.research.frontier import measure_scene
 
     spec, plan = _chosen(head, replay, tuple(raw or ()), tuple(psf or ())), load_protocol(protocol or DEFAULT_PROTOCOL)
     uploader = HttpsUploader(load_settings(send)) if send is not None else None
@@ -309,7 +309,7 @@ def take_frame(
     exposure_s: Annotated[float | None, typer.Option(min=1e-5, max=10, help="Exposure; else the head file's.")] = None,
 ) -> None:
     """Take one raw frame with the lamp dark, in the light that is there: of a scene, a point source or a cap."""
-    from services.lab.take_frames import summary, take_frames
+    from services.workshop.take_frames import summary, take_frames
 
     counts = take_frames(head, output, count, exposure_s, SystemClock())
     typer.echo(f"{output}: {summary(counts)}")
@@ -333,7 +333,7 @@ def light_for_meter(
     No person looks in. The light guard permits no continuous light: half of the time is dark. The exit status is 1 if
     the ring is brighter than the guard counts, or than an eye may see.
     """
-    from services.lab import measured_light, power_meter
+    from services.workshop import measured_light, power_meter
 
     spec = load_head(head)
     spec = measured_light.in_colour(spec, colour) if colour else spec
@@ -364,7 +364,7 @@ def judge_light(
     A reading that such a ring cannot give is refused. The exit status is 1 for NO GO.
     """
     from device.light_safety.hazard import light_limits
-    from services.lab import measured_light, optics_report
+    from services.workshop import measured_light, optics_report
 
     spec = load_head(head)
     if colour:
@@ -408,7 +408,7 @@ def calibrate_head(
 ) -> None:
     """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
     from services.instrument.calibration_request import CalibrationRequest
-    from services.lab.calibrate_head import calibrate, measured_values
+    from services.workshop.calibrate_head import calibrate, measured_values
 
     mishaps = {stand: name for stand, _, name in (pair.partition("=") for pair in mishap or ())}
     options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps
@@ -435,8 +435,8 @@ def show_trial_lenses(
     """
     from device.optics.trial_lens import PowerVector
     from services.instrument.trial_lens_measurement import LensBench
-    from services.lab.check_head import with_archive
-    from services.lab.trial_lens_check import calibrate_with_lenses
+    from services.workshop.check_head import with_archive
+    from services.workshop.trial_lens_check import calibrate_with_lenses
 
     _progress("the lamp shines for moments: a trainer eye stands before the head, and no person")
     spec, bench = with_archive(load_head(head), archive), LensBench(vertex_mm, PowerVector(eye_dpt))
@@ -453,9 +453,9 @@ def show_white_card(
 
     Without it they have the hue of photographs. The reference goes into the calibration in force.
     """
-    from services.lab.calibration_words import details
-    from services.lab.check_head import with_archive
-    from services.lab.white_card_check import measure_white_card
+    from services.workshop.calibration_words import details
+    from services.workshop.check_head import with_archive
+    from services.workshop.white_card_check import measure_white_card
 
     _progress("the lamp shines for moments: a white card stands before the head, and no person")
     stored = measure_white_card(with_archive(load_head(head), archive), SystemClock(), _ask_operator, typer.echo)
@@ -496,7 +496,7 @@ def check_head(
         raise typer.Exit(_check_model_eye(head, archive, (raw, psf, dark), exposure_s, as_json))
     if raw or psf or dark or exposure_s or as_json:
         raise typer.BadParameter("--raw, --psf, --dark, --exposure-s and --json go with --model-eye")
-    from services.lab.check_head import (  # imports the drivers only for this command
+    from services.workshop.check_head import (  # imports the drivers only for this command
         check_calibration,
         table,
         with_archive,
@@ -515,8 +515,8 @@ def _check_model_eye(
     head: Path, archive: Path | None, files: tuple[Path | None, ...], exposure_s: float | None, as_json: bool
 ) -> int:
     """Print the check of the model eye with the frame of `files` (raw, psf, dark) or a new one; return the status."""
-    from services.lab import model_eye
-    from services.lab.check_head import with_archive
+    from services.workshop import model_eye
+    from services.workshop.check_head import with_archive
 
     raw, psf, dark = files
     if (raw is None) != (psf is None) or (dark is not None and raw is None):
@@ -559,7 +559,7 @@ def simulate(
 
     Only the effects that the scene calls for are simulated; the plan says for each which number decided.
     """
-    from services.lab import simulate_scene  # imports the simulator only for this command
+    from services.research import simulate_scene  # imports the simulator only for this command
 
     spec = load_head(scene_file(scene))
     selected = simulate_scene.SelectedEffects(everything, tuple(only or ()), tuple(without or ()))
@@ -594,8 +594,8 @@ def frontier(
     no_peers: NoPeers = False,
 ) -> None:
     """Measure accuracy against time: every method, bin and number of rounds, on this machine."""
-    from services.lab import frontier as measured  # imports the simulator only for this command
-    from services.lab import frontier_pairs
+    from services.research import frontier as measured  # imports the simulator only for this command
+    from services.research import frontier_pairs
 
     request = measured.FrontierRequest(
         scene and scene_file(scene),
@@ -630,7 +630,7 @@ def show_data_set(
     every: Annotated[bool, typer.Option("--all", help="Also pairs that the list of test files leaves out.")] = False,
 ) -> None:
     """Say what a folder of lensless recordings holds: layout, pairs, sizes, PSFs, orientation."""
-    from services.lab import dataset_summary
+    from services.research import dataset_summary
 
     dataset = open_dataset(folder, psf, "all" if every else "test")
     typer.echo(dataset_summary.summary(dataset))
@@ -658,8 +658,8 @@ def bench_data_set(
 
     The exit status is 1 if a pair, or a method on a pair, was left out.
     """
-    from services.lab import benchmark  # imports the simulator only for this command
-    from services.lab.pair_scores import table
+    from services.research import benchmark  # imports the simulator only for this command
+    from services.research.pair_scores import table
 
     request = benchmark.BenchmarkRequest(
         open_dataset(folder, psf), limit, tuple(method or ()), repeats, json_file, resources.fft_plans()
@@ -672,45 +672,32 @@ def bench_data_set(
     raise typer.Exit(1 if found.left_out else 0)
 
 
-@app.command()
-def paper(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for report.html.")],
-    only: Annotated[
-        list[str] | None, typer.Option(help="Just this experiment (N, T, S0 ... S13, M, L, D); may be repeated.")
-    ] = None,
-    merged: Annotated[int, typer.Option(min=1, max=3, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
-) -> None:
+def _run_experiments(package: str, words: list[str]) -> None:
+    """Run a package of experiments of the checkout as a process, with the words that follow its command."""
+    if not (resources.ROOT / "tests" / package).is_dir():
+        raise SettingError(
+            f"`diffuscope {package}` runs experiments that an installed package does not hold",
+            "Run it in a checkout of the project, after `make .venv/ready`.",
+        )
+    # -P: a folder `tests` of the working directory is not that of the checkout.
+    command = [sys.executable, "-P", "-m", f"tests.{package}", *words]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(resources.ROOT)}, check=False)
+    raise typer.Exit(done.returncode)
+
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+
+@app.command(context_settings=PASSED_ON, add_help_option=False)
+def paper(context: typer.Context) -> None:
     """Repeat the paper's experiments in the simulator and report them; fails if an assertion does not hold."""
-    from services.lab.paper import report  # imports the simulator only for this command
-
-    ran = report.run_experiments(output, SystemClock(), lambda line: typer.echo(line, err=True), only or (), merged)
-    typer.echo(report.table(ran))
-    typer.echo(f"{output / 'report.html'}: {sum(one.seconds for one in ran):.0f} s")
-    if not report.all_hold(ran):
-        raise typer.Exit(1)
+    _run_experiments("paper", context.args)
 
 
-@app.command()
-def hard(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for hard-cases.json, .md and pictures.")],
-    case: Annotated[list[str] | None, typer.Option(help="Just this row; may be repeated.")] = None,
-    method: Annotated[
-        list[str] | None, typer.Option(help="Just this column: ladder (as shipped) or a method; may be repeated.")
-    ] = None,
-    merged: Annotated[int, typer.Option(min=1, max=4, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
-    check: Annotated[bool, typer.Option("--check", help="The exit status is 1 if there is a violation.")] = False,
-) -> None:
-    """Run the grid of hard cases: every kind of bad frame through every method and the ladder as shipped."""
-    from services.lab.hard_cases import grid  # imports the simulator only for this command
-    from services.lab.hard_cases.cells import COLUMNS
-
-    eyes = tuple(replace(eye, merged=merged) for eye in grid.EYES)
-    found = grid.run(eyes, case or (), tuple(method or COLUMNS), lambda line: typer.echo(line, err=True))
-    grid.write(output, found)
-    typer.echo(grid.summary(found))
-    typer.echo(f"{output}: hard-cases.json, hard-cases.md and a picture of each eye")
-    if check and found.violations:
-        raise typer.Exit(1)
+@app.command(context_settings=PASSED_ON, add_help_option=False)
+def hard(context: typer.Context) -> None:
+    """Run the grid of hard cases: every kind of bad frame through every method and the default schedule."""
+    _run_experiments("hard", context.args)
 
 
 @app.command()
@@ -730,8 +717,8 @@ def optics(
     ] = False,
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
-    from services.lab import head_search, light_path_plot, light_report
-    from services.lab import optics_report as budget
+    from services.workshop import head_search, light_path_plot, light_report
+    from services.workshop import optics_report as budget
 
     if head is not None and sensor is not None:
         raise typer.BadParameter("choose --head or --sensor, not both")
@@ -784,14 +771,14 @@ def root(
     """Image reconstruction for a funduscope whose lens is a piece of diffuser; and the whole instrument."""
 
 
-def main(words: list[str] | None = None) -> None:
-    """Run the command line with `words`, by default the process arguments.
+def main(words: list[str] | None = None, program: typer.Typer = app, name: str | None = None) -> None:
+    """Run a program with `words`, by default `diffuscope` with the process arguments; `name` is shown in its help.
 
     For a DiffuscopeError, or a command that needs an extra (`instrument`, `archive`) which is not installed, print the
     message and its remedy to stderr and exit with status 2.
     """
     try:
-        app(words)
+        program(words, prog_name=name)
     except DiffuscopeError as error:
         typer.echo(f"error: {error.message}\n{error.remedy}", err=True)
         sys.exit(2)

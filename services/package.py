@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from device.errors import DiffuscopeError, FrameError, PsfError, SettingError, SpecError
     from device.recon.methods import Method
-    from services.lab.dataset_pairs import Dataset, Pair
-    from services.lab.datasets import open_dataset
-    from services.lab.frontier_result import Frontier
-    from services.lab.python_api import (
+    from services.research.dataset_pairs import Dataset, Pair
+    from services.research.datasets import open_dataset
+    from services.research.frontier_result import Frontier
+    from services.research.python_api import (
         ForwardModel,
         ReconstructionOptions,
         Reconstructor,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         reconstruct,
         simulate,
     )
-    from services.lab.reconstruct_file import FileReconstruction, FileReport
+    from services.research.reconstruct_file import FileReconstruction, FileReport
 
 __all__ = [
     "Dataset",
@@ -59,10 +59,10 @@ __version__ = version("diffuscope")
 _MODULES = {
     "device.errors": ("DiffuscopeError", "FrameError", "PsfError", "SettingError", "SpecError"),
     "device.recon.methods": ("Method",),
-    "services.lab.dataset_pairs": ("Dataset", "Pair"),
-    "services.lab.datasets": ("open_dataset",),
-    "services.lab.frontier_result": ("Frontier",),
-    "services.lab.python_api": (
+    "services.research.dataset_pairs": ("Dataset", "Pair"),
+    "services.research.datasets": ("open_dataset",),
+    "services.research.frontier_result": ("Frontier",),
+    "services.research.python_api": (
         "ForwardModel",
         "ReconstructionOptions",
         "Reconstructor",
@@ -72,7 +72,7 @@ _MODULES = {
         "reconstruct",
         "simulate",
     ),
-    "services.lab.reconstruct_file": ("FileReconstruction", "FileReport"),
+    "services.research.reconstruct_file": ("FileReconstruction", "FileReport"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

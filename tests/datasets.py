@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from device.config.head_file import load_head
 from device.config.image_files import read_image
-from services.lab.simulate_scene import SelectedEffects, write_scene
+from services.research.simulate_scene import SelectedEffects, write_scene
 
 SCENE = Path(__file__).parents[1] / "device" / "sim" / "scenes" / "diabetic.toml"
 ROWS, COLS = 60, 80

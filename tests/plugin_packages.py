@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.project_files import ROOT
 
-GALLERY = ROOT / "services" / "lab" / "site" / "gallery"
+GALLERY = ROOT / "services" / "research" / "site" / "gallery"
 OWN_SOLVER = (GALLERY / "own_solver.py").read_text(encoding="utf-8")
 OWN_EFFECT = (GALLERY / "own_effect.py").read_text(encoding="utf-8")
 

@@ -416,7 +416,7 @@ def test_the_clock_is_the_only_source_of_time() -> None:
         "device/clock.py: time": "the implementation of SystemClock",
         "device/clock.py: datetime.now": "the implementation of SystemClock.wall",
         "device/light_safety/guard.py: Timer": "switches the lamp off when the threads that use a Clock hang",
-        "services/lab/lensless_peer.py: time": "a program of another environment, which cannot import `device`",
+        "services/research/lensless_peer.py: time": "a program of another environment, which cannot import `device`",
         "services/delivery/uploader.py: Timer": "aborts an upload that hangs in a socket, where no Clock is used",
     }
     check_rule(time_sources, python_files("device", "services"), allowed, "Clock and Deadline are arguments")
@@ -471,7 +471,13 @@ def umask_writes(source: str) -> Iterator[Violation]:
 
 def test_data_is_written_private_whatever_the_umask() -> None:
     """A person who starts the program by hand has umask 022: other users of the computer could read names."""
-    user = ("services/lab/", "services/cli.py", "device/sim/scene_files.py")  # write where their user says
+    user = (
+        "services/research/",
+        "services/workshop/",
+        "services/archive/",
+        "services/cli.py",
+        "device/sim/scene_files.py",
+    )  # write where their user says
     names = [name for name in python_files("device", "services") if not name.startswith((*user, "device/atomic_io.py"))]
     public = "in a folder of every boot, for services of other users"
     allowed = {
@@ -517,7 +523,7 @@ def test_folders_are_listed_without_hidden_companions() -> None:
         "services/records/capture_journal.py: iterdir": whole,
         "services/identity/card_settings.py: glob": whole,
         "device/calibration/archive.py: glob": parts,
-        "services/lab/archive/result.py: glob": parts,
+        "services/archive/result.py: glob": parts,
         "services/update/sources.py: glob": parts,
         "device/config/device_nodes.py: glob": own,
         "services/health/collector.py: glob": own,

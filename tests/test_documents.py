@@ -15,7 +15,7 @@ from scipy import signal
 from tests.project_files import ROOT, TOP_FOLDERS, files, nodes, python_files, text
 from tests.scenes import speckle
 
-SITE = "services/lab/site/"
+SITE = "services/research/site/"
 DOCUMENTS = [
     name
     for name in files()
@@ -89,7 +89,7 @@ def missing_names(markdown: str) -> list[str]:
 
 
 def test_a_missing_name_is_noticed() -> None:
-    gone = "`device.recon.gone` `services.lab.frontier.gone` `gone.py` `core/gone.js`"
+    gone = "`device.recon.gone` `services.research.frontier.gone` `gone.py` `core/gone.js`"
     assert missing_names(gone) == gone.replace("`", "").split()
     assert missing_names("`device.recon.methods.METHODS` `exam_loop.py` `core/capture.js` `hardware.parts`") == []
     here = "tests/test_documents.py::test_a_missing_name_is_noticed"

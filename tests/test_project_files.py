@@ -34,6 +34,8 @@ from services.update.command import app as update_app
 from services.update.ipc import REQUEST_FILE, TABLET
 from services.update.settings import UpdateSettings
 from services.update.settings import load_settings as load_settings
+from tests.hard.__main__ import app as hard
+from tests.paper.__main__ import app as paper
 from tests.project_files import BIN, ROOT, TOP_FOLDERS, Violation, check_rule, files, nodes, python_files, text
 
 
@@ -127,7 +129,7 @@ def test_the_wheel_holds_what_the_instrument_needs_at_run_time(wheel: Path) -> N
     """The wheel contains the page, migrations, scenes and heads, which are not Python files."""
     held = {path.relative_to(wheel).as_posix() for path in wheel.rglob("*")}
     moved = tomllib.loads(text("pyproject.toml"))["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
-    code = {name for name in files() if re.match(r"(device|services)/(?!lab/site/)", name)} - set(moved)
+    code = {name for name in files() if re.match(r"(device|services)/(?!research/site/)", name)} - set(moved)
     beside = {name for name in files() if re.match(r"web/|hardware/(heads/|optics.toml)|CHANGELOG.md", name)}
     beside |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
     assert (code | {*moved.values()} | {f"diffuscope/{name}" for name in beside}) - held == set()
@@ -190,6 +192,7 @@ def code_in(markdown: str) -> list[str]:
 def commands() -> dict[str, set[str]]:
     """Return the commands of `diffuscope`, subcommands included, each with its options."""
     group = typer.main.get_group(app)
+    group.commands |= {"paper": typer.main.get_command(paper), "hard": typer.main.get_command(hard)}
     inner = [
         (f"{name} {second}", command)
         for name, outer in group.commands.items()
@@ -300,7 +303,7 @@ NO_DOCUMENT = {
     "diffuscope/CHANGELOG.md": "its path in the wheel",
     "decisions/NNNN-title.md": "the form of a name",
 }
-SITE = "services/lab/site/"  # its build checks the links, some to pages that it writes
+SITE = "services/research/site/"  # its build checks the links, some to pages that it writes
 
 
 def sections(markdown: str) -> dict[str, set[str]]:

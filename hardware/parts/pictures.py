@@ -16,7 +16,7 @@ from hardware.parts import assembly, bought
 from hardware.parts.dimensions import Dimensions
 from hardware.parts.sheet import MEASURE, Sheet, labels
 from hardware.parts.view import Drawn, Offset, View, cut
-from services.lab.plot import line, text
+from services.plot import line, text
 
 BESIDE = {"LED cap", "LED cover", "LED matrix"}  # cut where LEDs of the ring are
 UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from html import escape
 
 from hardware.parts.view import Drawn
-from services.lab.plot import STYLE, line, text
+from services.plot import STYLE, line, text
 
 STYLE_HERE = """
   path { stroke: #1d2330; stroke-linejoin: round; fill-rule: evenodd; vector-effect: non-scaling-stroke; }

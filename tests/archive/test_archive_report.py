@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from device.config.marked_files import stated_in, tiff_bytes
-from services.lab.archive.report import write_report
-from services.lab.archive.table import age_days, encoded_table
+from services.archive.report import write_report
+from services.archive.table import age_days, encoded_table
 
 ROWS, MOST_S = 100_000, 30.0
 

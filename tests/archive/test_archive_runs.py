@@ -21,9 +21,9 @@ from device.calibration.archive import Archive as Calibrations
 from device.calibration.archive import Provenance
 from device.clock import VirtualClock
 from device.values import Sensor
-from services.lab.archive.plan import InputFile, PlannedCalibration, read_plan
-from services.lab.archive.result import ResultFolder
-from services.lab.archive.solve import CalibrationFiles, Solvers, Task, local_names
+from services.archive.plan import InputFile, PlannedCalibration, read_plan
+from services.archive.result import ResultFolder
+from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
 from tests.archive.conftest import COMMAND, FRAMES, Archive, result_digests, write_recording
 from tests.datasets import Scene
 from tests.scenes import calibration

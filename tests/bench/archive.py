@@ -23,11 +23,11 @@ import tifffile
 
 from device.config.head_file import load_head
 from device.sim.render import crop_or_pad
-from services.lab.archive import cluster
-from services.lab.archive.plan import Plan, read_plan
-from services.lab.archive.report import LOSS_DB
-from services.lab.archive.result import TABLE, ResultFolder
-from services.lab.archive.solve import CalibrationFiles, Solvers, Task, local_names
+from services.archive import cluster
+from services.archive.plan import Plan, read_plan
+from services.archive.report import LOSS_DB
+from services.archive.result import TABLE, ResultFolder
+from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
 from tests.simulated import expected_electrons, small_head_toml, world
 
 COMMAND = str(Path(sys.executable).parent / "diffuscope")

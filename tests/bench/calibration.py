@@ -19,7 +19,7 @@ from device.sim.simulated_calibration import flat_frame
 from device.sim.world import World
 from device.values import Calibration, ExposureSettings, Illumination, Psf, Sensor
 from services.instrument.calibration_request import CalibrationRequest
-from services.lab.calibrate_head import calibrate
+from services.workshop.calibrate_head import calibrate
 from tests.bench.dioptres import MOST_RMS_DPT, factors, refracted
 from tests.simulated import with_keys
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from device.errors import SettingError
 from device.values import Image
-from services.lab.peers import ENVIRONMENT, LenslessPeer
+from services.research.peers import ENVIRONMENT, LenslessPeer
 
 PYTHON = ENVIRONMENT / "bin" / "python"
 

@@ -19,8 +19,8 @@ from device.config.image_files import read_psf
 from device.recon.assessment.image_quality import MISMATCHES
 from device.sim.scene_files import simulate_exposure
 from device.values import Image, Report
-from services.lab.reconstruct_file import reconstruct_file
-from services.lab.reconstruct_inputs import ReconstructOptions
+from services.research.reconstruct_file import reconstruct_file
+from services.research.reconstruct_inputs import ReconstructOptions
 from tests.simulated import SCENES, with_keys
 from tests.wrong_psfs import orientations, resized, shuffled
 

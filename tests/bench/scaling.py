@@ -15,7 +15,7 @@ from device.clock import SystemClock
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Calibration, Geometry, Psf, Sensor
-from services.lab.plot import Mark, Plot, Series, log_axis, svg, time_axis
+from services.plot import Mark, Plot, Series, log_axis, svg, time_axis
 from tests.bench import timing
 from tests.scenes import speckle
 

@@ -15,7 +15,7 @@ from device.clock import VirtualClock
 from device.config.head_file import load_head
 from device.sim.simulated_calibration import simulated_calibration
 from services.instrument.calibration_request import CalibrationRequest
-from services.lab.calibrate_head import calibrate
+from services.workshop.calibrate_head import calibrate
 from tests.browser.axe import axe_faults
 from tests.browser.conftest import SMALL_PLANS, Complaints, Server, copy_small_plans
 from tests.browser.looks import SIZES, look_for_faults

@@ -18,7 +18,7 @@ from tests.project_files import ROOT, files
 pytestmark = pytest.mark.site
 
 SITE = ROOT / "out" / "site"
-SCRIPTS = sorted(Path(name).stem for name in files() if re.fullmatch(r"services/lab/site/gallery/\w+\.py", name))
+SCRIPTS = sorted(Path(name).stem for name in files() if re.fullmatch(r"services/research/site/gallery/\w+\.py", name))
 
 
 class Page(HTMLParser):

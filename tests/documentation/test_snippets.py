@@ -43,7 +43,8 @@ def snippets(page: str) -> list[tuple[str, str]]:
 PAGES = [
     name
     for name in files()
-    if re.fullmatch(r"services/lab/site/[\w-]+\.md", name) and {"sh", "python"} & {kind for kind, _ in snippets(name)}
+    if re.fullmatch(r"services/research/site/[\w-]+\.md", name)
+    and {"sh", "python"} & {kind for kind, _ in snippets(name)}
 ]
 
 
@@ -78,7 +79,7 @@ def in_folder(folder: Path) -> Iterator[None]:
 
 
 def test_pages_have_snippets() -> None:
-    assert "services/lab/site/first_picture.md" in PAGES
+    assert "services/research/site/first_picture.md" in PAGES
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -105,9 +105,6 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "data",
     "bench {0}/scene --method guess --no-peers",
     "bench {0}/none",
-    "paper -o {0}/paper --only nothing",
-    "hard -o {0}/hard --case nothing",
-    "hard -o {0}/hard --method guess",
     "calibrations",
     "calibrations list --archive {0}/a",
     "calibrations new-key {0}/key --name Ada",
@@ -138,13 +135,19 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     *(f"update {word} --settings {{0}}/none.toml" for word in ("restart", "settle", "answer", "tidy")),
     "update install {0}/none.raucb --settings {0}/none.toml",
 )
-PROGRAMS = (  # of units and of RAUC, each in a separate process
+EXPERIMENTS = (["paper"], ["hard"])  # commands that only start one of the programs below
+PROGRAMS = (  # of units, of RAUC and of experiments, each in a separate process
     "-m services.update --help",
     "-m services.update fly",
     "device/drivers/blank.py --help",
     "device/drivers/blank.py",
     "device/drivers/blank.py --device {0}/none",
     "services/update/bootchooser.py fly",
+    "-m tests.paper --help",
+    "-m tests.paper -o {0}/paper --only nothing",
+    "-m tests.hard --help",
+    "-m tests.hard -o {0}/hard --case nothing",
+    "-m tests.hard -o {0}/hard --method guess",
 )
 
 
@@ -223,7 +226,9 @@ def called(words: list[str]) -> dict[str, Any]:
 def _made(folder: Path) -> dict[str, Any]:
     """Return the part of the record that one process makes."""
     (folder / "head.toml").write_text(HEAD)
-    helps = {" ".join(["diffuscope", *words]): called([*words, "--help"]) for words in commands()}
+    helps = {
+        " ".join(["diffuscope", *words]): called([*words, "--help"]) for words in commands() if words not in EXPERIMENTS
+    }
     calls = []
     for call in CALLS:
         kept = [path.name for path in (folder / "a").glob("*") if len(path.name) == 16]

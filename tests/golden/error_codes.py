@@ -52,7 +52,7 @@ def _all_texts() -> frozenset[str]:
     """Return the template of every text in the sources, except docstrings and the scripts of the documentation."""
     found = set[str]()
     for name in python_files(*SOURCES):
-        if name.startswith("services/lab/site/"):
+        if name.startswith("services/research/site/"):
             continue
         inside = {id(part) for node in nodes(text(name)) if isinstance(node, ast.JoinedStr) for part in node.values}
         docs = {id(node.value) for node in nodes(text(name)) if isinstance(node, ast.Expr)}

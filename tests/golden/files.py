@@ -36,7 +36,6 @@ from services.delivery.visit_json import visit_as_json
 from services.errors import PinWrong, ReceiverUnreachable
 from services.http.authentication import PinAuthenticator
 from services.instrument.accuracy_explorer import AccuracyExplorer
-from services.lab.frontier import measure_scene
 from services.records import digested_json
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_report import report_as_json
@@ -46,6 +45,7 @@ from services.records.protocol import load_protocol
 from services.records.upload_queue import UploadQueue, UploadReceipt
 from services.records.visit import Visit
 from services.records.visit_repository import VisitRepository
+from services.research.frontier import measure_scene
 from services.update.ipc import STATE_FILE, StoredError, read_state, write_state
 from services.update.state import StateFile
 from tests.golden import compare

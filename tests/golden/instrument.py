@@ -42,10 +42,10 @@ from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
 from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
-from services.lab.frontier import measure_scene
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.upload_queue import UploadReceipt
+from services.research.frontier import measure_scene
 from tests.simulated import small_head_toml
 from tests.updates import Board
 

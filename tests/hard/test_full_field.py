@@ -13,10 +13,10 @@ import pytest
 
 from device.recon.reconstructor import Reconstructor
 from device.values import Mask, Reconstruction
-from services.lab.hard_cases import defects
-from services.lab.hard_cases.cases import saturated
-from services.lab.hard_cases.frames import Eye, HardFrame
 from tests import scenes
+from tests.hard import defects
+from tests.hard.cases import saturated
+from tests.hard.frames import Eye, HardFrame
 
 EYE = Eye("relaxed eye", "sim", {"sim.seed": 2})
 Within = Callable[[float, float], None]

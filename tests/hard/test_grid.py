@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.lab.hard_cases.cases import CASES, CLEAN, NAMED
-from services.lab.hard_cases.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
-from services.lab.hard_cases.frames import Eye
-from services.lab.hard_cases.grid import run
-from services.lab.hard_cases.judgement import KINDS, covered, kind, violations
-from services.lab.reconstruct_file import reconstruct_file
+from services.research.reconstruct_file import reconstruct_file
+from tests.hard.cases import CASES, CLEAN, NAMED
+from tests.hard.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
+from tests.hard.frames import Eye
+from tests.hard.grid import run
+from tests.hard.judgement import KINDS, covered, kind, violations
 
 EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
 REDUCED = (

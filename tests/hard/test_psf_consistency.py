@@ -11,8 +11,8 @@ from device.recon.assessment.image_quality import MISMATCHES
 from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
 from device.sim.scene_files import SimulatedExposure, simulate_exposure
 from device.values import Calibration, Counts, Image, Psf
-from services.lab.reconstruct_file import reconstruct_file
-from services.lab.reconstruct_inputs import ReconstructOptions
+from services.research.reconstruct_file import reconstruct_file
+from services.research.reconstruct_inputs import ReconstructOptions
 from tests import scenes
 from tests.simulated import coarse, with_keys
 from tests.wrong_psfs import orientations, shuffled

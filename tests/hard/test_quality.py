@@ -13,9 +13,9 @@ from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, ExposureSettings, Illumination, Psf
-from services.lab.hard_cases.cases import peak
-from services.lab.hard_cases.frames import Eye
 from tests import scenes
+from tests.hard.cases import peak
+from tests.hard.frames import Eye
 from tests.simulated import SCENES, coarse, exposed_counts, with_keys
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"

@@ -17,9 +17,9 @@ import pytest
 from device.clock import VirtualClock
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Image
-from services.lab.hard_cases.defects import blob
-from services.lab.hard_cases.frames import Eye
 from tests import scenes
+from tests.hard.defects import blob
+from tests.hard.frames import Eye
 
 EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
 RANDOM, ADVERSE, PIXEL, RING = 105.0, 135.0, 45.0, 0.0075

@@ -19,7 +19,7 @@ from services.imaging.picture_files import raw_tiff
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture, simulated_head
 from services.instrument.background import run_in_subprocess
-from services.lab.frontier import measure_scene
+from services.research.frontier import measure_scene
 from tests.journey.conftest import SMALL_HEAD
 
 

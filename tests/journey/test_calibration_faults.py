@@ -10,7 +10,7 @@ from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import CalibrationRefused, SettingError
 from services.instrument.calibration_request import CalibrationRequest
-from services.lab.calibrate_head import calibrate
+from services.workshop.calibrate_head import calibrate
 from tests.journey.conftest import SMALL_HEAD, Diffuscope
 
 SMALL = (

@@ -22,7 +22,7 @@ from services.http.problem_responses import problem_response
 from services.imaging.picture_files import raw_tiff
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.calibration_monitor import exposures
-from services.lab.check_head import check_calibration, table
+from services.workshop.check_head import check_calibration, table
 from tests.journey.conftest import Diffuscope
 from tests.journey.faults import simulated_light
 

@@ -13,8 +13,8 @@ from device.config.image_files import read_image
 from device.errors import InputError
 from services.cli import main
 from services.http.server import bind_socket
-from services.lab.reconstruct_file import reconstruct_file
-from services.lab.reconstruct_inputs import ReconstructOptions
+from services.research.reconstruct_file import reconstruct_file
+from services.research.reconstruct_inputs import ReconstructOptions
 from tests.journey.conftest import Diffuscope
 from tests.progress_lines import without_progress
 

@@ -11,7 +11,7 @@ import pytest
 from device.errors import SettingError
 from device.recon.methods import METHODS
 from services.cli import main
-from services.lab.peers import LenslessPeer
+from services.research.peers import LenslessPeer
 from tests.datasets import Scene, simulate_tiny, write_pairs, write_tutorial
 
 # Its "picture" is the frame itself; a frame without contrast ends the program.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.imaging.picture_files import to_png
-from services.lab.montage_files import read_picture
+from services.research.montage_files import read_picture
 from tests.journey.wrong_inputs import call
 from tests.moving_retina import WIDE_RETINA, gaze
 

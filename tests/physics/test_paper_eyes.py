@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from services.lab.paper.bench import Bench
-from services.lab.paper.report import EXPERIMENTS
-from services.lab.paper.trainer import magnification
+from tests.paper.bench import Bench
+from tests.paper.report import EXPERIMENTS
+from tests.paper.trainer import magnification
 
 pytestmark = pytest.mark.paper
 

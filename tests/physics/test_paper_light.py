@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from services.lab.paper.bench import Bench
-from services.lab.paper.light import WEAK, human_light, shipped_heads
-from services.lab.paper.report import EXPERIMENTS
-from services.lab.paper.rules import SCENES as RULED
-from services.lab.paper.rules import compare_rules
-from services.lab.paper.screen import FLAT, dots_before_and_after
+from tests.paper.bench import Bench
+from tests.paper.light import WEAK, human_light, shipped_heads
+from tests.paper.report import EXPERIMENTS
+from tests.paper.rules import SCENES as RULED
+from tests.paper.rules import compare_rules
+from tests.paper.screen import FLAT, dots_before_and_after
 
 pytestmark = pytest.mark.paper
 
@@ -51,7 +51,7 @@ def test_every_assertion_about_lenslets_holds() -> None:
 
 def test_readme_has_the_gain_of_gradient_under_both_rules_for_mu() -> None:
     printed = figures(
-        "services/lab/README.md",
+        "services/research/README.md",
         r"it is ([\d.]+) to ([\d.]+) dB nearer to the truth, by cross-validation for both ([\d.]+) to ([\d.]+) dB",
     )
     found = [compare_rules(Bench(), name) for name in RULED]
@@ -62,7 +62,7 @@ def test_readme_has_the_gain_of_gradient_under_both_rules_for_mu() -> None:
 
 
 def test_readme_has_the_ssim_of_the_dots() -> None:
-    printed = figures("services/lab/paper/README.md", r"On a flat screen it is ([\d.]+) and ([\d.]+) here")
+    printed = figures("tests/paper/README.md", r"On a flat screen it is ([\d.]+) and ([\d.]+) here")
     bench = Bench()
     take = bench.expose("paper_dots", FLAT)
     found = [take.score(picture).ssim for picture in dots_before_and_after(bench, take)]

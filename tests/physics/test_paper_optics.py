@@ -5,8 +5,8 @@ The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which
 
 import pytest
 
-from services.lab.paper.bench import Bench
-from services.lab.paper.report import EXPERIMENTS
+from tests.paper.bench import Bench
+from tests.paper.report import EXPERIMENTS
 
 pytestmark = pytest.mark.paper
 

@@ -9,11 +9,11 @@ import pytest
 from device.optics.light_path import load_light_path
 from device.optics.traced_relay import traced_relay
 from services import resources
-from services.lab.paper.bench import Bench
-from services.lab.paper.edges import edge_signs
-from services.lab.paper.printed import WIDE_LATTICE, field_to_rims_deg, lattice_deg
-from services.lab.paper.report import EXPERIMENTS
-from services.lab.paper.screen import FLOOR
+from tests.paper.bench import Bench
+from tests.paper.edges import edge_signs
+from tests.paper.printed import WIDE_LATTICE, field_to_rims_deg, lattice_deg
+from tests.paper.report import EXPERIMENTS
+from tests.paper.screen import FLOOR
 
 pytestmark = pytest.mark.paper
 

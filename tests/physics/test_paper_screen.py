@@ -6,9 +6,9 @@ The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which
 import numpy as np
 import pytest
 
-from services.lab.paper.bench import Bench, rectangle
-from services.lab.paper.report import EXPERIMENTS
-from services.lab.paper.screen import CUT, HRF_DEG
+from tests.paper.bench import Bench, rectangle
+from tests.paper.report import EXPERIMENTS
+from tests.paper.screen import CUT, HRF_DEG
 
 pytestmark = pytest.mark.paper
 

@@ -16,10 +16,10 @@ from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
 from device.values import Calibration, Image, Psf, Sensor
-from services.lab.benchmark import BenchmarkRequest, benchmark
-from services.lab.datasets import open_dataset
-from services.lab.reconstruct_file import reconstruct_file
-from services.lab.reconstruct_inputs import ReconstructOptions
+from services.research.benchmark import BenchmarkRequest, benchmark
+from services.research.datasets import open_dataset
+from services.research.reconstruct_file import reconstruct_file
+from services.research.reconstruct_inputs import ReconstructOptions
 from tests.wrong_psfs import orientations, resized, shuffled
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "lensless"

@@ -11,7 +11,7 @@ import pytest
 from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.light_safety.dose_ledger import MemoryLedger
-from services.lab.power_meter import pulse, run_of
+from services.workshop.power_meter import pulse, run_of
 from tests.ports.conftest import HEAD
 from tests.ports.emulators.kills import DARK_S, Sleeper
 from tests.ports.emulators.wires import SINKS, emulated_buses

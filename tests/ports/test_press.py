@@ -26,7 +26,7 @@ from device.sim.world import World
 from device.values import Calibration, ExposureSettings, HeadIdentity, Illumination, Image, Psf
 from device.values import Sensor as CountsOf
 from services.cli import main
-from services.lab.calibration_archive import activate
+from services.workshop.calibration_archive import activate
 from tests.ports.conftest import small_head
 from tests.ports.emulators.memory import MemoryAllocator
 from tests.ports.emulators.sensor import Sensor

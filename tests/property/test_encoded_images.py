@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.lab.python_api import reconstruct
+from services.research.python_api import reconstruct
 from tests.property.encoded_images import (
     Encoded,
     difference,

@@ -37,6 +37,9 @@ from device.recon.assessment.frame_quality import Verdict
 from device.recon.reconstructor import Recipe
 from device.sim.scene_files import simulate_exposure
 from device.values import Counts, ExposureSettings, Frame, Illumination, Report, SimulatedCounts
+from services.archive.plan import read_plan
+from services.archive.result import ResultFolder
+from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
 from services.cli import app
 from services.imaging.picture_files import raw_tiff, to_png
 from services.imaging.raw_metadata import RawMetadata
@@ -44,18 +47,15 @@ from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCaptur
 from services.instrument.camera_tap import CameraTap
 from services.instrument.capture import ExposedCapture, Press, capture_files
 from services.instrument.visit_montage import join_pictures
-from services.lab.archive.plan import read_plan
-from services.lab.archive.result import ResultFolder
-from services.lab.archive.solve import CalibrationFiles, Solvers, Task, local_names
-from services.lab.frontier import measure_scene
-from services.lab.frontier_thumbnails import Shown, thumbnail_panel
-from services.lab.paper.pictures import plane, side_by_side
 from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_target import CaptureTarget
+from services.research.frontier import measure_scene
+from services.research.frontier_thumbnails import Shown, thumbnail_panel
 from tests.journey.asking import next_preview, visit_with_consent
 from tests.journey.conftest import Rig, coarsened, rig_builder
 from tests.journey.wrong_inputs import call
 from tests.moving_retina import PSF, RETINA, SHAPE, WIDE_RETINA, frame, gaze, seen
+from tests.paper.pictures import plane, side_by_side
 from tests.simulated import small_head_toml
 from tests.stored_captures import write_store
 from tests.unit.test_archive_adopt import FILE, HERE, NAMES, RAW, adopted, planned, write_results
@@ -462,20 +462,20 @@ WRITERS = {
     "services/instrument/capture_pipeline.py live_picture": "test_quick_look_and_live_picture",
     "services/instrument/exam_events.py quick_look": CAPTURE,
     "services/instrument/visit_montage.py join_pictures": "test_montage_of_a_visit",
-    "services/lab/archive/adopt.py _adopt": "test_adopted_pictures",
-    "services/lab/archive/report.py _thumbnail": IN_REPORT,
-    "services/lab/archive/solve.py solve": "test_pictures_of_an_archive",
-    "services/lab/frontier_thumbnails.py _png": "test_thumbnails_of_a_frontier",
-    "services/lab/montage_files.py montage_files": "test_montage",
-    "services/lab/paper/pictures.py _png": "test_pictures_of_the_paper",
-    "services/lab/reconstruct_burst.py reconstruct_burst": "test_reconstruct_burst",
-    "services/lab/reconstruct_colour.py _joined": "test_reconstruct_channels",
-    "services/lab/reconstruct_colour.py _press": OF_PRESS,
-    "services/lab/reconstruct_each.py _reconstruct_one": EACH,
-    "services/lab/reconstruct_file.py reconstruct_file": "test_reconstruct",
-    "services/lab/reconstruct_file.py save": "test_python",
-    "services/lab/reconstruct_file.py write_picture": "test_reconstruct",
-    "services/lab/take_frames.py take_frames": "test_simulate_and_frame",
+    "services/archive/adopt.py _adopt": "test_adopted_pictures",
+    "services/archive/report.py _thumbnail": IN_REPORT,
+    "services/archive/solve.py solve": "test_pictures_of_an_archive",
+    "services/research/frontier_thumbnails.py _png": "test_thumbnails_of_a_frontier",
+    "services/research/montage_files.py montage_files": "test_montage",
+    "tests/paper/pictures.py _png": "test_pictures_of_the_paper",
+    "services/research/reconstruct_burst.py reconstruct_burst": "test_reconstruct_burst",
+    "services/research/reconstruct_colour.py _joined": "test_reconstruct_channels",
+    "services/research/reconstruct_colour.py _press": OF_PRESS,
+    "services/research/reconstruct_each.py _reconstruct_one": EACH,
+    "services/research/reconstruct_file.py reconstruct_file": "test_reconstruct",
+    "services/research/reconstruct_file.py save": "test_python",
+    "services/research/reconstruct_file.py write_picture": "test_reconstruct",
+    "services/workshop/take_frames.py take_frames": "test_simulate_and_frame",
     "services/records/frame_writer.py _write": CAPTURE,
 }
 ENCODERS = {
@@ -503,16 +503,16 @@ NO_PICTURES = {
     "device/sim/photo.py _eight_bits": "resamples",
     "services/delivery/visit_export.py zip_archive": "copies files that state the mark",
     "services/imaging/picture_files.py to_jpeg": "resamples",
-    "services/lab/dataset_pairs.py _placed": "resamples",
-    "services/lab/hard_cases/cells.py files": "inputs of a command, deleted after it",
-    "services/lab/lensless_peer.py solve": "answer of a process of another solver",
-    "services/lab/paper/pictures.py side_by_side": "resamples",
-    "services/lab/peers.py __call__": "input of a process of another solver",
+    "services/research/dataset_pairs.py _placed": "resamples",
+    "tests/hard/cells.py files": "inputs of a command, deleted after it",
+    "services/research/lensless_peer.py solve": "answer of a process of another solver",
+    "tests/paper/pictures.py side_by_side": "resamples",
+    "services/research/peers.py __call__": "input of a process of another solver",
 }
 
 
 def calls(wanted: Callable[[ast.Call, str], bool]) -> set[str]:
-    """Return file and function of each call in device, services and hardware for which `wanted` holds."""
+    """Return file and function of each call, in product and experiments, for which `wanted` holds."""
     found = set()
 
     def walk(node: ast.AST, place: str, function: str) -> None:
@@ -523,9 +523,9 @@ def calls(wanted: Callable[[ast.Call, str], bool]) -> set[str]:
                     found.add(f"{place} {function}")
             walk(child, place, child.name if isinstance(child, ast.FunctionDef) else function)
 
-    for root in ("device", "services", "hardware"):
+    for root in ("device", "services", "hardware", "tests/paper", "tests/hard"):
         for path in (ROOT / root).rglob("*.py"):
-            if "gallery" not in path.parts:
+            if "gallery" not in path.parts and not path.name.startswith("test_"):
                 walk(ast.parse(path.read_text(encoding="utf-8")), str(path.relative_to(ROOT)), "module")
     return found
 

@@ -10,10 +10,10 @@ import tifffile
 from PIL import Image
 
 from device.clock import VirtualClock
-from services.lab.archive.adopt import Adopted, adopt_results
-from services.lab.archive.content import software
-from services.lab.archive.plan import Plan, PlannedCalibration, PlannedCapture, PlanSettings
-from services.lab.archive.result import ResultFolder
+from services.archive.adopt import Adopted, adopt_results
+from services.archive.content import software
+from services.archive.plan import Plan, PlannedCalibration, PlannedCapture, PlanSettings
+from services.archive.result import ResultFolder
 from services.records.capture import RecordOrigin
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import FILE

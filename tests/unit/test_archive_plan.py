@@ -9,9 +9,9 @@ from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
 from device.errors import SettingError
 from device.values import FrameUse, Report
-from services.lab.archive.content import NAME_DIGITS, different_versions, result_name, software
-from services.lab.archive.plan import Plan, PlanSettings, read_plan, write_plan
-from services.lab.archive.planning import make_plan
+from services.archive.content import NAME_DIGITS, different_versions, result_name, software
+from services.archive.plan import Plan, PlanSettings, read_plan, write_plan
+from services.archive.planning import make_plan
 from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_store import CaptureStore
 from tests.datasets import Scene, simulate_tiny

@@ -30,7 +30,7 @@ from device.sim.camera import SimCamera
 from device.sim.world import World
 from device.values import Calibration, Illumination, Psf, Sensor
 from services.instrument.calibration_request import CalibrationRequest
-from services.lab.calibrate_head import calibrate
+from services.workshop.calibrate_head import calibrate
 from tests import scenes
 from tests.bench.calibration import pictures, true_calibration
 from tests.unit.test_calibration_measurements import FLAWS, small_world

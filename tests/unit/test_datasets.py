@@ -8,9 +8,9 @@ import pytest
 
 from device.clock import VirtualClock
 from device.errors import FrameError, PsfError, SettingError
-from services.lab.dataset_pairs import Pair
-from services.lab.dataset_summary import check, summary
-from services.lab.datasets import open_dataset
+from services.research.dataset_pairs import Pair
+from services.research.dataset_summary import check, summary
+from services.research.datasets import open_dataset
 from tests.companions import add_companions
 from tests.datasets import COLS, ROWS, WRITERS, Scene, simulate_tiny, stored, write_dlmd, write_pairs
 

@@ -590,7 +590,7 @@ def test_plan_follows_threshold_and_options() -> None:
 
 def test_the_documents_show_the_plan_as_the_command_prints_it() -> None:
     root = SCENES.parents[2]
-    page = (root / "services/lab/site/simulation.md").read_text()
+    page = (root / "services/research/site/simulation.md").read_text()
     assert format_plan(decide(scene(load_head(SCENES / "calm.toml")))) in page
     for document in (page, (root / "README.md").read_text()):
         assert f"has {len(EFFECTS)} effects" in document

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image as Pictures
 
 from device.recon.methods import METHODS
-from services.lab.frontier_plot import draw_frontier, drawn_points
-from services.lab.frontier_result import (
+from services.research.frontier_plot import draw_frontier, drawn_points
+from services.research.frontier_result import (
     BestMu,
     Choice,
     FrameSize,
@@ -25,7 +25,7 @@ from services.lab.frontier_result import (
     Point,
     ScoredRegion,
 )
-from services.lab.frontier_thumbnails import (
+from services.research.frontier_thumbnails import (
     SIDE_PX,
     Shown,
     detailed_place,

@@ -19,8 +19,8 @@ from device.optics.light_path import load_light_path, relay_of
 from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm, ring_for_pupil
 from device.optics.ray_trace import Surface
 from device.optics.traced_relay import traced_relay
-from services.lab.light_path_plot import draw_light_path
-from services.lab.light_report import AXIS_DISTANCE_MM, AXIS_HOLE_MM, at_full_drive, expected_uw
+from services.workshop.light_path_plot import draw_light_path
+from services.workshop.light_report import AXIS_DISTANCE_MM, AXIS_HOLE_MM, at_full_drive, expected_uw
 from tests.drawings import boxes, overlapping
 from tests.project_files import ROOT, text
 from tests.test_project_files import code_in, unknown_words

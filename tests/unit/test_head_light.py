@@ -14,8 +14,8 @@ from device.optics.light_budget import chain, product
 from device.sim.optical_setup import Scene
 from device.sim.scene_files import simulate
 from device.sim.world import World
-from services.lab.optics_report import design_of
-from services.lab.paper.bench import with_changes, with_merged_pixels
+from services.workshop.optics_report import design_of
+from tests.paper.bench import with_changes, with_merged_pixels
 from tests.simulated import SCENES, coarse, with_keys
 
 EYES = sorted(SCENES.glob("human_eye_*.toml"))

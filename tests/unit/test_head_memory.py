@@ -20,8 +20,8 @@ from device.sim.light import SimLight
 from device.sim.world import World
 from device.values import HeadIdentity
 from services.instrument.calibration_request import CalibrationRequest
-from services.lab.calibrate_head import calibrate_on
-from services.lab.calibration_archive import activate
+from services.workshop.calibrate_head import calibrate_on
+from services.workshop.calibration_archive import activate
 from tests.unit.test_archive import WHO, calibration
 from tests.unit.test_calibration_measurements import FLAWS, small_world
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from device.config.head_file import load_head
 from device.light_safety.hazard import Limits, light_limits, worst_beam
 from device.optics.illumination import TRANSMISSION_TO_EYE
-from services.lab.measured_light import MeterReading, judge
-from services.lab.optics_report import design_of
+from services.workshop.measured_light import MeterReading, judge
+from services.workshop.optics_report import design_of
 
 HEADS = Path(__file__).parents[2] / "hardware" / "heads"
 SPEC = load_head(HEADS / "imx296_power.toml")

@@ -12,7 +12,7 @@ from device.calibration.import_psf import ImportedPsfInfo, read_imported_psf
 from device.config.image_files import as_psf
 from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.values import Psf
-from services.lab.reconstruct_inputs import ReconstructOptions, load_psfs, load_raw
+from services.research.reconstruct_inputs import ReconstructOptions, load_psfs, load_raw
 from tests.journey.wrong_inputs import SHAPE, caustic, scene
 
 

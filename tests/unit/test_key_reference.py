@@ -8,14 +8,16 @@ from typing import Any
 import pytest
 
 from services import resources
-from services.lab.key_reference import PAGES, SITE
+from services.research.key_reference import PAGES, SITE
 
 SHIPPED = [*sorted(resources.HEADS.glob("*.toml")), *sorted(resources.SCENES.glob("*.toml"))]
 
 
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_is_that_of_the_models(name: str) -> None:
-    assert (SITE / name).read_text(encoding="utf-8") == PAGES[name](), ".venv/bin/python -m services.lab.key_reference"
+    assert (SITE / name).read_text(encoding="utf-8") == PAGES[name](), (
+        ".venv/bin/python -m services.research.key_reference"
+    )
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

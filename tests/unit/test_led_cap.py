@@ -11,9 +11,9 @@ from device.light_safety.hazard import light_limits
 from device.optics.led_cap import LedCap, centre_over_mean, dark_deg, half_maximum_deg, relative_irradiance, seen_share
 from device.optics.light_path import load_light_path
 from hardware.parts.dimensions import Fits, dimensions
-from services.lab.light_report import expected_beam, limit_shares
-from services.lab.light_tolerances import tolerances
-from services.lab.optics_report import design_of
+from services.workshop.light_report import expected_beam, limit_shares
+from services.workshop.light_tolerances import tolerances
+from services.workshop.optics_report import design_of
 from tests.project_files import text
 
 HARDWARE = Path(__file__).parents[2] / "hardware"

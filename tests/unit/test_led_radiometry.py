@@ -13,7 +13,7 @@ from device.head import hazard_of, open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics.illumination import photon_budget
 from services.instrument.calibration_request import CalibrationRequest
-from services.lab.calibrate_head import calibrate
+from services.workshop.calibrate_head import calibrate
 from tests.unit.test_calibration_measurements import small_world
 
 RING = (19, 20, 26, 29, 34, 37, 43, 44)

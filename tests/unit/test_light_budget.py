@@ -28,9 +28,9 @@ from device.optics.light_budget import (
 from device.optics.light_path import load_light_path
 from device.optics.matrix import ring, share_in_pupil
 from device.values import Colour, Illumination
-from services.lab import head_search, light_report
-from services.lab.light_report import at_full_drive, expected_beam, half_period_um
-from services.lab.optics_report import widest_iris_mm
+from services.workshop import head_search, light_report
+from services.workshop.light_report import at_full_drive, expected_beam, half_period_um
+from services.workshop.optics_report import widest_iris_mm
 from tests.project_files import text
 
 HARDWARE = Path(__file__).parents[2] / "hardware"

@@ -15,7 +15,7 @@ from device.optics import field_extent
 from device.optics.budget import Design, design_of_head, design_of_sensor, optical_budget
 from device.optics.eye import Relay
 from device.optics.light_path import led_ray_mm, load_light_path, planes_mm, ray_mm
-from services.lab.light_path_plot import draw_light_path
+from services.workshop.light_path_plot import draw_light_path
 from tests.drawings import boxes, overlapping
 
 HARDWARE = Path(__file__).parents[2] / "hardware"

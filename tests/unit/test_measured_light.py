@@ -17,15 +17,15 @@ from device.light_safety.hazard import light_limits
 from device.optics.light_budget import chain, log_sd, product
 from device.values import Illumination
 from services.cli import app
-from services.lab.light_report import at_full_drive, expected_beam, expected_uw, limit_shares
-from services.lab.measured_light import (
+from services.workshop.light_report import at_full_drive, expected_beam, expected_uw, limit_shares
+from services.workshop.measured_light import (
     MeteredLight,
     MeterReading,
     in_colour,
     judge,
     words,
 )
-from services.lab.optics_report import design_of
+from services.workshop.optics_report import design_of
 
 HEADS = Path(__file__).parents[2] / "hardware" / "heads"
 POWER = HEADS / "imx296_power.toml"

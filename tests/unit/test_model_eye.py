@@ -22,9 +22,9 @@ from device.optics.retina_chart import BAR_GROUPS, EYE_MM, GREY, INK, MARKS, RIN
 from device.sim import scene_files
 from device.sim.objects import draw_object
 from services.cli import app
-from services.lab.model_eye import ModelEyeFrame, check_model_eye, light_row, mean_tone, promise_of
-from services.lab.model_eye_fit import fit_chart, lit_diameter_px
-from services.lab.optics_report import design_of
+from services.workshop.model_eye import ModelEyeFrame, check_model_eye, light_row, mean_tone, promise_of
+from services.workshop.model_eye_fit import fit_chart, lit_diameter_px
+from services.workshop.optics_report import design_of
 from tests.simulated import small_head_toml
 
 HEADS = Path(__file__).parents[2] / "hardware" / "heads"

@@ -1,20 +1,20 @@
 """Report of `diffuscope paper`: failed assertions, self-contained page, refusals, and scenes of the bench."""
 
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from base64 import b64decode
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from device.clock import VirtualClock
 from device.errors import SettingError, SpecError, StoreError
 from device.sim.world import World
-from services.cli import app
-from services.lab.paper.bench import Bench, with_changes
-from services.lab.paper.outcome import Experiment, Figure, Outcome, above, attempted, below, within
-from services.lab.paper.pictures import plane, trend
-from services.lab.paper.report import EXPERIMENTS, ORDER, ExperimentRun, all_hold, html, run_experiments, table
+from tests.paper.bench import Bench, with_changes
+from tests.paper.outcome import Experiment, Figure, Outcome, above, attempted, below, within
+from tests.paper.pictures import plane, trend
+from tests.paper.report import EXPERIMENTS, ORDER, ExperimentRun, all_hold, html, run_experiments, table
 
 
 def ran(*claims, **more) -> list[ExperimentRun]:
@@ -142,8 +142,8 @@ def test_several_experiments_run_in_processes_and_stand_in_their_order(tmp_path)
 
 
 def test_command_prints_the_path_of_the_report(tmp_path) -> None:
-    done = CliRunner().invoke(app, ["paper", "-o", str(tmp_path), "--only", "N"])
-    assert done.exit_code == 0, done.output
+    command = [sys.executable, "-m", "services", "paper", "-o", "report", "--only", "N"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "report.html" in done.stdout
     assert "33.40" in done.stdout
 

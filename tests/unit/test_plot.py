@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.lab.frontier_result import pareto_front
-from services.lab.plot import Mark, Plot, Series, stacked_svg, svg, time_axis, value_axis
+from services.plot import Mark, Plot, Series, stacked_svg, svg, time_axis, value_axis
+from services.research.frontier_result import pareto_front
 
 SVG = "{http://www.w3.org/2000/svg}"
 places = st.lists(st.tuples(st.integers(1, 9).map(float), st.integers(0, 9).map(float)), min_size=1, max_size=30)

@@ -27,8 +27,8 @@ from device.sim.plan import decide
 from device.sim.scene_files import simulate
 from device.values import Calibration
 from services.cli import main
-from services.lab.frontier import ROUNDS, Case, measure_frontier, selected_methods
-from services.lab.frontier_plot import draw_frontier
+from services.research.frontier import ROUNDS, Case, measure_frontier, selected_methods
+from services.research.frontier_plot import draw_frontier
 from tests import scenes
 from tests.plugin_packages import GALLERY, OWN_EFFECT, OWN_SOLVER, installed
 from tests.simulated import small_head_toml

@@ -17,9 +17,9 @@ from device.light_safety.guard import AFTERGLOW_S
 from device.light_safety.hazard import light_limits
 from device.values import EYES
 from services.cli import app
-from services.lab.measured_light import MeterReading, in_colour, judge
-from services.lab.optics_report import design_of
-from services.lab.power_meter import judge_reading, pulse, run_of, words
+from services.workshop.measured_light import MeterReading, in_colour, judge
+from services.workshop.optics_report import design_of
+from services.workshop.power_meter import judge_reading, pulse, run_of, words
 from tests.project_files import text
 from tests.simulated import small_head_toml
 

@@ -10,10 +10,10 @@ import pytest
 
 from device.light_safety.dose_report import DoseReport
 from device.values import ChannelUse, Report
-from services.lab import report_schema
-from services.lab.reconstruct_file import FileReport
 from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection, RecordOrigin
 from services.records.capture_report import report_as_json
+from services.research import report_schema
+from services.research.reconstruct_file import FileReport
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 KEPT = sorted(GOLDEN.glob("kept*/data/captures/*/report.json"))
@@ -37,7 +37,7 @@ def described(schema: Mapping[str, object], at: str = "") -> Iterator[str]:
 
 def test_file_is_the_schema_of_the_code() -> None:
     written = report_schema.FILE.read_text(encoding="utf-8")
-    assert written == report_schema.schema_text(), ".venv/bin/python -m services.lab.report_schema"
+    assert written == report_schema.schema_text(), ".venv/bin/python -m services.research.report_schema"
 
 
 def test_every_key_of_every_report_has_a_description() -> None:

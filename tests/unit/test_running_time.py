@@ -6,7 +6,7 @@ import numba
 import pytest
 
 from device.clock import SystemClock
-from services.lab.running_time import working
+from services.running_time import working
 
 
 def test_a_short_computation_says_nothing() -> None:

@@ -27,8 +27,8 @@ from device.recon.reconstructor import Recipe, Reconstructor
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Psf, RefractionOffset, Sensor
 from services.instrument.trial_lens_measurement import LensBench, alignment_remedy, keep_offset
-from services.lab.check_head import with_archive
-from services.lab.trial_lens_check import calibrate_with_lenses, table
+from services.workshop.check_head import with_archive
+from services.workshop.trial_lens_check import calibrate_with_lenses, table
 from tests import scenes
 from tests.scenes import speckle
 from tests.simulated import coarse, exposed_counts, small_head_toml, with_keys, world

@@ -16,9 +16,9 @@ from device.optics.light_path import load_light_path
 from device.sim.replay import find_recording
 from device.user_files import files_in, read_text
 from services import resources
+from services.archive.plan import read_plan
 from services.delivery.uploader import load_settings as load_upload_settings
 from services.http.static_files import StaticFiles
-from services.lab.archive.plan import read_plan
 from services.records.protocol import load_protocol
 from services.update.settings import load_settings as load_update_settings
 from services.update.sources import find_bundle, list_bundles

@@ -22,9 +22,9 @@ from device.recon.white_balance import OVER_GREEN, RGB, balanced, light_dn_per_s
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Colour, Frame, Illumination, Psf, Sensor, WhiteReference
 from services.instrument.capture_pipeline import expose, plan_pipeline
-from services.lab.calibration_words import details
-from services.lab.check_head import with_archive
-from services.lab.white_card_check import measure_white_card
+from services.workshop.calibration_words import details
+from services.workshop.check_head import with_archive
+from services.workshop.white_card_check import measure_white_card
 from tests.scenes import speckle
 from tests.simulated import coarse, world
 

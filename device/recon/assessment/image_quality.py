@@ -27,7 +27,7 @@ PSF_FIGURES = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_
 SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
 FAINT_DN = 1e-9
 NO_SIGNAL = "There is no signal in this frame."
-# The words of these messages and of `quality_warnings` are sorted by KINDS in services/lab/hard_cases/judgement.py.
+# The words of these messages and of `quality_warnings` are sorted by KINDS in tests/hard/judgement.py.
 MISMATCHES = {
     Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
     Match.ROTATED: "The PSF is rotated by 180 degrees against this frame. Rotate the PSF by 180 degrees; run it again.",

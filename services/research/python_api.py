@@ -1,0 +1,348 @@
+"""Python interface for researchers: reconstruct, forward model, simulate and frontier, on arrays or files.
+
+`diffuscope` (services/package.py) exports it. Each function runs the same code as the command of its name. Images are
+(rows, cols), colour images (rows, cols, 3); the centre of a PSF is at (rows//2, cols//2).
+"""
+
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.config.head_file import InstrumentSpec, load_head
+from device.config.image_files import Raw, as_psf, read_psf
+from device.errors import FrameError, SettingError
+from device.recon.estimation.defective_pixels import without_hot_pixels
+from device.recon.estimation.parameter_selection import FrequencySample
+from device.recon.installed_methods import available_methods
+from device.recon.methods import Method
+from device.recon.model.fft_plans import Planner
+from device.recon.model.forward_model import Model, taper
+from device.recon.model.grid import Grid, support_radius_px
+from device.sim import scene_files
+from device.sim.plan import Decision, decide, format_plan
+from device.sim.render import crop_or_pad
+from device.sim.simulated_calibration import simulated_calibration
+from device.sim.world import World
+from device.values import Image, Mask, Psf, SimulatedCounts
+from services import resources
+from services.research.frontier import Case, measure_frontier, recorded_case, scene_case, selected_methods
+from services.research.frontier_result import Frontier
+from services.research.named_files import head_file, scene_file
+from services.research.psf_stack import psf_stack
+from services.research.reconstruct_file import FileReconstruction, FileReconstructor, parse_bayer
+from services.research.reconstruct_inputs import RawSource, ReconstructOptions, Source
+
+ImageSource = str | Path | NDArray[Any] | Raw | Psf
+
+
+class ReconstructionOptions(TypedDict, total=False):
+    """Keywords of `reconstruct` and `Reconstructor`; an option that is left out is chosen from PSF and frame.
+
+    `dark`: dark frame of the same exposure. `flat`: frame of even light. `head`: geometry of the light path and sensor,
+    as a head file, the name of a shipped head or scene, or the result of `simulate`. `field_deg`: diameter of the
+    illuminated disc in degrees, with `head`. `method`: name of `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels
+    per sample. `rounds`: largest number of rounds of an iterative method. `settings`: parameters of the method, such as
+    {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the raw is a mosaic of this pattern, "rggb", "bggr",
+    "grbg" or "gbrg"; "none": it is monochrome, whatever a DNG says. `refraction`: False leaves out the eye's
+    refraction, which is estimated with `head`.
+    """
+
+    dark: ImageSource
+    flat: ImageSource
+    head: "str | Path | SimulatedScene"
+    field_deg: float
+    method: str
+    bin: int
+    rounds: int
+    settings: Mapping[str, float]
+    budget_s: float
+    bayer: str
+    refraction: bool
+
+
+def reconstruct(
+    raw: ImageSource, psf: ImageSource | Sequence[ImageSource], **options: Unpack[ReconstructionOptions]
+) -> FileReconstruction:
+    """Return the picture of one raw frame, with its report.
+
+    `raw`: counts, (rows, cols) or (rows, cols, 3), an array, a file (tiff, png, npy, npz, dng), or the raw of a `Pair`.
+    `psf`: image of one bright point, (rows, cols) as `raw`, or the PSFs of a `Pair`; several, or a folder of files, are
+    a stack, of which the most likely one is used. `options`: `ReconstructionOptions`; TypeError for another keyword.
+    `picture` of the result is float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`; `report` is typed;
+    `simulated` is True if `raw` came from `simulate`. FrameError, PsfError or SettingError with a remedy for input that
+    cannot be used. Source: paper, section "Algorithm"; NUMERICS.md.
+    """
+    return Reconstructor(psf, **options)(raw)
+
+
+class Reconstructor:
+    """Reconstruction of many frames with one PSF: what does not depend on the frame is computed once.
+
+    `psf` and `options` as in `reconstruct`. Plans are made for the first frame of a shape (rows, cols) and kept. Use it
+    from one thread at a time. SettingError for options that are out of range or contradict each other.
+    """
+
+    def __init__(self, psf: ImageSource | Sequence[ImageSource], **options: Unpack[ReconstructionOptions]) -> None:
+        self._reconstruct = FileReconstructor(_options(psf, options))
+
+    def __call__(self, raw: ImageSource) -> FileReconstruction:
+        """Return the picture of one raw frame (rows, cols) or (rows, cols, 3), as `reconstruct` does."""
+        return self._reconstruct(_raw(raw))
+
+
+class ForwardModel:
+    """Forward model y = crop(h * x) of a PSF h: the frame y of an object x, the adjoint, and the noise of a frame.
+
+    An object is float32 of `object_shape`, a frame float32 of `frame_shape`, both (rows, cols) in samples of bin x bin
+    pixels and linear DN. The object is larger than the frame, because light from outside of it reaches the sensor.
+    `shape`: (rows, cols) of the sensor in pixels, by default that of `psf`. `field_radius_px`: radius of the lit disc,
+    outside of which the object is 0; None: not known. PsfError for an invalid PSF, SettingError for an invalid `bin` or
+    radius. Source: paper, equation (1); NUMERICS.md 1.
+    """
+
+    def __init__(
+        self,
+        psf: ImageSource,
+        shape: tuple[int, int] | None = None,
+        *,
+        bin: int = 1,
+        field_radius_px: float | None = None,
+    ) -> None:
+        source = _source(psf)
+        kernel = without_hot_pixels(read_psf(source) if isinstance(source, Path) else as_psf(source, "the PSF"))
+        sensor = shape or kernel.shape
+        if not 1 <= bin <= min(sensor):
+            raise SettingError(f"a bin of {bin} does not fit {sensor[0]} x {sensor[1]} pixels", "Give a bin from 1.")
+        if field_radius_px is not None and not field_radius_px > 0:
+            raise SettingError(f"a field of radius {field_radius_px:g} px is empty", "Give a radius above 0, or None.")
+        radius_px = float("inf") if field_radius_px is None else field_radius_px
+        grid = Grid.tight(sensor, bin, radius_px, support_radius_px(kernel))
+        self._model = Model(kernel, grid, Planner(resources.fft_plans()))
+        self._sample = FrequencySample.of(self._model)
+
+    @property
+    def object_shape(self) -> tuple[int, int]:
+        """(rows, cols) of an object, in samples."""
+        return self._model.grid.shape
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(rows, cols) of a frame, in samples."""
+        return self._model.grid.window
+
+    def forward(self, x: Image) -> Image:
+        """Return the frame of an object of `object_shape`: float32 of `frame_shape`; FrameError for another shape."""
+        _require(x, self.object_shape, "the object")
+        return self.crop(self._model.blur(x * self._model.mask))
+
+    def adjoint(self, y: Image) -> Image:
+        """Return the adjoint of `forward` for a frame of `frame_shape`: float32 of `object_shape`.
+
+        <forward(x), y> = <x, adjoint(y)> for every x and y. FrameError for another shape.
+        """
+        adjoint: Image = self._model.blur_adjoint(self.embed(y)) * self._model.mask
+        return adjoint
+
+    def embed(self, y: Image) -> Image:
+        """Return an object of `object_shape` that is `y` (of `frame_shape`) in front of the sensor, and 0 elsewhere."""
+        _require(y, self.frame_shape, "the frame")
+        x: Image = np.zeros(self.object_shape, np.float32)
+        x[self._model.grid.slices] = y
+        return x
+
+    def crop(self, x: Image) -> Image:
+        """Return the part of an object of `object_shape` in front of the sensor: float32 of `frame_shape`."""
+        _require(x, self.object_shape, "the object")
+        return np.ascontiguousarray(x[self._model.grid.slices], np.float32)
+
+    def noise_dn(self, y: Image) -> float:
+        """Return the standard deviation of the noise of a frame of `frame_shape`, in DN per sample.
+
+        It is measured at the quarter of the frequencies that the PSF transmits least (NUMERICS.md 2.1); the mean of a
+        frame whose noise is shot noise. FrameError for another shape.
+        """
+        _require(y, self.frame_shape, "the frame")
+        window, fft = taper(self.frame_shape), self._model.fft
+        fft.space[:] = 0
+        fft.space[self._model.grid.slices] = (y - np.float32(y.mean(dtype=np.float64))) * window
+        size = self._model.grid.size
+        variance = self._sample.noise_variance(self._sample.energies(fft.forward()), size) * size
+        return float(np.sqrt(variance / float(np.vdot(window, window))))
+
+
+@dataclass(frozen=True)
+class SimulatedScene:
+    """Simulated exposures with their ground truth, all (rows, cols) of the sensor.
+
+    `raw`: counts, uint16, of a type that marks pictures made of it as simulated. `frames`: the frames of the burst, of
+    which `raw` is the first. `truth`: reflectance of the object,
+    float32. `psf`: noise-free PSF of the present eye, float32. `vessels`: mask of the vessels, None if not known.
+    `plan`: decision on every effect, by its name. `write` keeps all of it in files.
+    """
+
+    name: str
+    raw: SimulatedCounts
+    truth: Image
+    psf: Image
+    vessels: Mask | None
+    plan: Mapping[str, Decision]
+    frames: tuple[SimulatedCounts, ...]
+    world: World = field(repr=False)
+
+    def explain(self) -> str:
+        """Return the plan as a text table: each effect, simulated or not, and the figure that decided."""
+        return format_plan(tuple(self.plan.values()))
+
+    def write(self, folder: str | Path) -> None:
+        """Write raw.tiff (raw-2.tiff, ...), truth.npy, psf.tiff, vessels.png and plan.json; StoreError on failure."""
+        scene_files.write(self.world, [np.asarray(one) for one in self.frames], Path(folder))
+
+
+def simulate(
+    scene: str | Path,
+    *,
+    everything: bool = False,
+    only: Sequence[str] = (),
+    without: Sequence[str] = (),
+    frames: int = 1,
+) -> SimulatedScene:
+    """Return simulated exposures of a scene, with their ground truth.
+
+    `scene`: a scene file, or the name of one of device/sim/scenes/, such as "healthy". Only the effects that could be
+    seen are simulated; `everything`, `only` and `without` (names of effects) overrule the plan. `frames`: number
+    of exposures of one burst, with the same diffuser and eye, and new noise and motion. SettingError for an unknown
+    scene or effect, or for `everything` with `only`; SpecError for an invalid scene file.
+    """
+    spec = load_head(scene_file(scene))
+    world, taken = scene_files.expose(
+        spec, lambda setting: decide(setting, everything=everything, only=tuple(only), without=tuple(without)), frames
+    )
+    counts = tuple(one.view(SimulatedCounts) for one in taken)
+    colour = spec.light.colour
+    mask = world.retina.vessels
+    return SimulatedScene(
+        name=spec.name,
+        raw=counts[0],
+        truth=world.truth(colour),
+        psf=crop_or_pad(world.psf(colour), world.shape),
+        vessels=None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5,
+        plan={one.name: one for one in world.plan},
+        frames=counts,
+        world=world,
+    )
+
+
+def frontier(
+    raw: ImageSource | None = None,
+    psf: ImageSource | None = None,
+    truth: ImageSource | None = None,
+    *,
+    scene: str | Path | SimulatedScene | None = None,
+    head: str | Path | SimulatedScene | None = None,
+    field_deg: float | None = None,
+    method: str | Sequence[str] = (),
+    budget_s: float = 0.26,
+    repeats: int = 7,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Frontier:
+    """Return accuracy against time of every method, bin and number of rounds, on this machine.
+
+    Either `raw`, `psf` and `truth`, (rows, cols) of one grid (a shift and the intensity are fitted), or `scene`:
+    a scene file, the name of one, or the result of `simulate`. `head` and `field_deg` as in `reconstruct`. `method`:
+    name of `methods()` or FILE.py:NAME, one or several; by default all. `budget_s`: time in seconds within which the
+    instrument chooses. `repeats`: timed runs of each point; their median counts.
+    `progress` is called with one line per step. SettingError if both or neither are given; FrameError for a truth of
+    another shape.
+    """
+    if repeats < 1 or not budget_s > 0:
+        raise SettingError("a time is measured at least once, within a budget above 0", "Give repeats and budget_s.")
+    recorded = [part for part in (raw, psf, truth) if part is not None]
+    if (scene is None) == (not recorded) or len(recorded) in (1, 2):
+        raise SettingError("a frontier needs a frame with its truth", "Give scene=, or raw, psf and truth together.")
+    if scene is not None:
+        case = _scene_case(scene)
+    else:
+        assert raw is not None
+        assert psf is not None
+        assert truth is not None
+        files = _raw(raw), _source(psf), _source(truth)
+        case = recorded_case(*files, _head(head), field_deg, resources.fft_plans())
+    chosen = selected_methods((method,) if isinstance(method, str) else method)
+    return measure_frontier(case, resources.fft_plans(), budget_s, repeats, progress, chosen)
+
+
+def methods() -> dict[str, Method]:
+    """Return the built-in and the installed methods by name, each with a sentence, its cost in FFT pairs and settings.
+
+    SettingError names the package of a plug-in that cannot be loaded.
+    """
+    return available_methods()
+
+
+def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOptions) -> ReconstructOptions:
+    _refuse_unknown(given)
+    dark, flat = given.get("dark"), given.get("flat")
+    psfs = psf if isinstance(psf, list | tuple) else (psf,)
+    return ReconstructOptions(
+        raw=Path(),
+        psfs=psf_stack([_source(one) for one in psfs]),
+        output=None,
+        method=given.get("method"),
+        budget_s=given.get("budget_s"),
+        dark=None if dark is None else _source(dark),
+        flat=None if flat is None else _source(flat),
+        head=_head(given.get("head")),
+        field_deg=given.get("field_deg"),
+        even=False,
+        plans=resources.fft_plans(),
+        bin=given.get("bin"),
+        rounds=given.get("rounds"),
+        settings=dict(given.get("settings", {})),
+        bayer=parse_bayer(given.get("bayer")),
+        refraction=given.get("refraction", True),
+    )
+
+
+def _raw(image: ImageSource) -> RawSource:
+    return image if isinstance(image, Raw) else _source(image)
+
+
+def _source(image: ImageSource) -> Source:
+    """Return an image as an input of a reconstruction; a PSF without pedestal stays as it is when cleaned again."""
+    if isinstance(image, Psf | Raw):
+        return image.pixels
+    return Path(image) if isinstance(image, str) else image
+
+
+def _refuse_unknown(given: ReconstructionOptions) -> None:
+    """Raise TypeError for a keyword that is no option, with the nearest one, as Python does for an unknown argument."""
+    known = ReconstructionOptions.__annotations__
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"choose from {', '.join(known)}"
+            raise TypeError(f"'{name}' is no option of a reconstruction: {hint}")
+
+
+def _head(head: "str | Path | SimulatedScene | None") -> Path | InstrumentSpec | None:
+    if isinstance(head, SimulatedScene):
+        return head.world.spec
+    return None if head is None else head_file(head)
+
+
+def _scene_case(scene: str | Path | SimulatedScene) -> Case:
+    if not isinstance(scene, SimulatedScene):
+        return scene_case(load_head(scene_file(scene)))
+    counts, calibration = np.asarray(scene.raw), simulated_calibration(scene.world)
+    return Case(scene.name, counts, scene.truth, scene.vessels, calibration, False)
+
+
+def _require(image: Image, shape: tuple[int, int], what: str) -> None:
+    if image.shape != shape:
+        given = " x ".join(map(str, image.shape))
+        raise FrameError(f"{what} has {given} samples, and {shape[0]} x {shape[1]} are needed", "See `embed`.")

@@ -1,0 +1,118 @@
+"""One run of the grid of hard cases: reconstructs all cells and writes `hard-cases.json`, tables and pictures."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from device.errors import SettingError
+from services.research.reconstruct_file import write_or_raise
+from tests.hard.cases import CASES, CLEAN, NAMED
+from tests.hard.cells import COLUMNS, CaseRunner, Cell
+from tests.hard.frames import Eye
+from tests.hard.judgement import Violation, covered, violations
+from tests.hard.picture import draw_grid, explanations, table
+
+EYES = (
+    Eye("relaxed eye, paper's sensor", "sim", {"sim.seed": 1}),
+    Eye("short-sighted eye, paper's sensor", "sim", {"sim.seed": 7, "sim.eye.m_dpt": 2.5}),
+    Eye("long-sighted eye, IMX296", "imx296", {"sim.seed": 5, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}),
+)
+ProgressCallback = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class HardCases:
+    """Cells of a run, and the violations found in them."""
+
+    columns: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    violations: tuple[Violation, ...]
+
+    @property
+    def eyes(self) -> tuple[str, ...]:
+        """Return the names of the eyes, in order."""
+        return tuple(dict.fromkeys(cell.eye for cell in self.cells))
+
+    def picture(self, eye: str) -> str:
+        """Return the SVG of one eye's grid."""
+        return draw_grid(self.cells, self.violations, eye, self.columns)
+
+
+def run(
+    eyes: Sequence[Eye] = EYES,
+    keys: Sequence[str] = (),
+    columns: tuple[str, ...] = COLUMNS,
+    progress: ProgressCallback = lambda line: None,
+) -> HardCases:
+    """Run the cases `keys` (default: all) and the clean one of each eye through `columns`; return cells and violations.
+
+    `progress` is called with one line per eye and case. SettingError for an unknown case or column.
+    """
+    for known, asked, what in ((NAMED, keys, "hard case"), (COLUMNS, columns, "column")):
+        for name in asked:
+            if name not in known:
+                raise SettingError(f"no {what} is called {name!r}", f"Choose from: {'; '.join(known)}.")
+    cells: list[Cell] = []
+    for eye in eyes:
+        progress(f"{eye.name}: planning")
+        with TemporaryDirectory() as folder:
+            grid = CaseRunner(eye, Path(folder), columns)
+            for case in CASES:
+                if not keys or case.key in keys or case is CLEAN:
+                    cells += grid.cells(case)
+                    progress(f"{eye.name}: {case.key}: {_brief(cells[-len(columns)])}")
+    return HardCases(columns, tuple(cells), tuple(violations(cells)))
+
+
+def _brief(cell: Cell) -> str:
+    if cell.pcc is None:
+        return f"refused: {cell.refused}"
+    eye = "no refraction" if cell.sphere_dpt is None else f"{cell.sphere_dpt:+.2f} +- {cell.sd_dpt:.2f} dpt"
+    return f"{cell.method} PCC {cell.pcc:.3f} ({-(cell.lost or 0):+.3f}), {eye}" + "".join(
+        f"; {words}" for words in cell.warnings
+    )
+
+
+def write(folder: Path, found: HardCases) -> None:
+    """Write `hard-cases.json`, `hard-cases.md` and a picture of each eye; StoreError if a file cannot be written."""
+    write_or_raise(folder, lambda: folder.mkdir(parents=True, exist_ok=True))
+    whole = {
+        "cells": [asdict(cell) | {"off_sd": cell.off_sd} for cell in found.cells],
+        "violations": [asdict(one) for one in found.violations],
+    }
+    pages = {"hard-cases.json": json.dumps(whole, indent=1) + "\n", "hard-cases.md": markdown(found)}
+    pages |= {f"hard-cases-{k}.svg": found.picture(eye) for k, eye in enumerate(found.eyes, 1)}
+    for name, content in pages.items():
+        write_or_raise(folder / name, partial((folder / name).write_text, content, encoding="utf-8"))
+
+
+def markdown(found: HardCases) -> str:
+    """Return the Markdown report: table, explained losses, violations."""
+    share, count = covered(found.cells)
+    lines = [
+        "# Hard cases",
+        "",
+        "PCC inside the lit field, in brackets its change against the same method's clean frame.",
+        table(found.cells, found.columns),
+        "",
+        "## Explained losses",
+        "",
+        *(f"* {where}: {why}" for where, why in explanations(found.cells).items()),
+        "",
+        "## Violations",
+        "",
+        f"{share:.0%} of {count} refractions lie within two standard deviations.",
+        "",
+        summary(found),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def summary(found: HardCases) -> str:
+    """Return one line per violation, and a line with the numbers of violations and cells."""
+    lines = [f"* {one.rule}: {one.eye}; {one.case}; {one.method}: {one.words}" for one in found.violations]
+    return "\n".join([*lines, f"{len(found.violations)} violations in {len(found.cells)} cells"])

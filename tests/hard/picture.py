@@ -1,0 +1,144 @@
+"""Heat map of the grid as SVG, and its Markdown tables: a row per hard case, a column per method."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from services.plot import STYLE, text
+from tests.hard.cases import CASES, NAMED
+from tests.hard.cells import Cell
+from tests.hard.judgement import Violation, explanation, lost
+
+LEFT, TOP, WIDE, TALL, GAP, SKIP = 250, 150, 104, 24, 2, 10
+SHADES = (  # upper limit of the loss, colour, text colour
+    (0.01, "#1a7f5a", "#ffffff"),
+    (0.05, "#8fd0a8", "#10231a"),
+    (0.15, "#f3dc8c", "#33290a"),
+    (0.4, "#e89a5b", "#2e1706"),
+    (float("inf"), "#b8403a", "#ffffff"),
+)
+REFUSED = "#8a8f98", "#ffffff"
+LEGEND = (
+    "PCC inside the lit field; in brackets its change against the same method's clean frame",
+    "m: a message is given   e: explained below the table   red frame: must not be",
+)
+
+
+def draw_grid(cells: Sequence[Cell], broken: Sequence[Violation], eye: str, columns: Sequence[str]) -> str:
+    """Return the SVG of one eye's grid; colour: loss of PCC against the clean frame, red frame: violation."""
+    mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
+    bad = {(one.case, one.method) for one in broken if one.eye == eye}
+    inner, y, group = [], TOP, ""
+    for case in CASES:
+        if not any((case.key, column) in mine for column in columns):
+            continue
+        y, group = y + (SKIP if group and case.group != group else 0), case.group
+        inner.append(text(LEFT - 10, y + TALL - 7, case.key, "small", "end"))
+        row = mine[case.key, columns[0]]
+        inner.append(text(LEFT + len(columns) * WIDE + 8, y + TALL - 7, _refraction(row), "small"))
+        for k, column in enumerate(columns):
+            cell = mine[case.key, column]
+            inner += _cell(cell, LEFT + k * WIDE, y, (case.key, column) in bad)
+        y += TALL
+    return _document(eye, columns, inner, y)
+
+
+def _document(eye: str, columns: Sequence[str], inner: Sequence[str], y: int) -> str:
+    wide, tall = LEFT + len(columns) * WIDE + 150, y + 24
+    heads = [text(LEFT + (k + 0.5) * WIDE, TOP - 10, name, "small", "middle") for k, name in enumerate(columns)]
+    heads.append(text(LEFT + len(columns) * WIDE + 8, TOP - 10, "refraction error", "small"))
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
+            f'role="img" aria-label="Hard cases, {escape(eye)}"><style>{STYLE}</style>',
+            f'<rect class="ground" width="{wide}" height="{tall}"/>',
+            text(20, 32, f"Hard cases: {eye}", "title"),
+            *(text(20, 56 + 18 * k, line, "quiet small") for k, line in enumerate(LEGEND)),
+            *_scale(),
+            *heads,
+            *inner,
+            "</svg>\n",
+        ]
+    )
+
+
+def _scale() -> list[str]:
+    out, x, before = [text(20, 106, "PCC lost:", "small")], 90, 0.0
+    for limit, colour, ink in SHADES:
+        words = f"< {limit:g}" if limit != float("inf") else f"> {before:g}"
+        out += [_box(x, 92, 60, 20, colour), _label(x + 30, 106, words, ink)]
+        x, before = x + 62, limit
+    return [*out, _box(x, 92, 60, 20, REFUSED[0]), _label(x + 30, 106, "refused", REFUSED[1])]
+
+
+def _cell(cell: Cell, x: int, y: int, broken: bool) -> list[str]:
+    colour, ink = REFUSED
+    words, says = "crashed" if cell.crashed else "refused", cell.refused
+    if cell.pcc is not None and cell.lost is not None:
+        colour, ink = next((c, i) for limit, c, i in SHADES if not cell.lost >= limit)
+        explained = lost(cell) and explanation(cell, NAMED[cell.case])
+        marks = ("m" if cell.warnings else "") + ("e" if explained else "")
+        words = f"{cell.pcc:.2f} ({-cell.lost:+.2f}) {marks}".rstrip()
+        says = " / ".join(cell.warnings)
+    out = [
+        f"<g><title>{escape(f'{cell.case}, {cell.method}: {says}')}</title>",
+        _box(x, y, WIDE - GAP, TALL - GAP, colour),
+        _label(x + WIDE / 2 - 1, y + TALL - 8, words, ink),
+    ]
+    if broken:
+        out.append(
+            f'<rect x="{x + 1}" y="{y + 1}" width="{WIDE - GAP - 2}" height="{TALL - GAP - 2}" fill="none" '
+            'stroke="#e00000" stroke-width="3"/>'
+        )
+    return [*out, "</g>"]
+
+
+def _refraction(cell: Cell) -> str:
+    if cell.sphere_dpt is None:
+        return "none"
+    if cell.off_sd is None:
+        return f"{cell.sphere_dpt:+.2f} of none"
+    return f"{cell.off_sd:+.1f} sd"
+
+
+def _box(x: float, y: float, wide: float, tall: float, colour: str) -> str:
+    return f'<rect x="{x:g}" y="{y:g}" width="{wide:g}" height="{tall:g}" fill="{colour}"/>'
+
+
+def _label(x: float, y: float, words: str, ink: str) -> str:
+    return f'<text x="{x:g}" y="{y:g}" class="small" text-anchor="middle" style="fill:{ink}">{escape(words)}</text>'
+
+
+def table(cells: Sequence[Cell], columns: Sequence[str]) -> str:
+    """Return one Markdown table per eye: cases by columns, refraction error, messages."""
+    lines: list[str] = []
+    for eye in dict.fromkeys(cell.eye for cell in cells):
+        mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
+        lines += [
+            "",
+            f"## {eye}",
+            "",
+            f"| case | {' | '.join(columns)} | refraction | messages |",
+            "|---|" + "---|" * (len(columns) + 2),
+        ]
+        for case in dict.fromkeys(cell.case for cell in cells if cell.eye == eye):
+            row = mine[case, columns[0]]
+            lines.append(
+                f"| {case} | {' | '.join(_figures(mine[case, name]) for name in columns)} | "
+                f"{_refraction(row)} | {' '.join(row.warnings) or row.refused} |"
+            )
+    return "\n".join(lines)
+
+
+def _figures(cell: Cell) -> str:
+    if cell.crashed:
+        return "crashed"
+    return "refused" if cell.pcc is None or cell.lost is None else f"{cell.pcc:.3f} ({-cell.lost:+.3f})"
+
+
+def explanations(cells: Sequence[Cell]) -> Mapping[str, str]:
+    """Return the reasons for worse pictures without a message that have one, by the key "CASE, METHOD"."""
+    return {
+        f"{cell.case}, {cell.method}": explanation(cell, NAMED[cell.case])
+        for cell in cells
+        if lost(cell) and not cell.warnings and explanation(cell, NAMED[cell.case])
+    }
