@@ -279,8 +279,8 @@ class ChannelUse:
 
     What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one. `reason`
     says why a colour is missing in the picture; None for one that the picture has. `white_ratio` is the light of its
-    frame over that of a white card in the same lamp light; None without a white reference: the hue is then that of
-    photographs.
+    frame over that of a white card in the same lamp light; None without a white reference: the hue is then
+    neutral, that of an average retina.
     """
 
     name: Colour

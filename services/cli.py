@@ -451,7 +451,7 @@ def show_white_card(
 ) -> None:
     """Show a white card to the head's own light: colour pictures then have the colours of the retina.
 
-    Without it they have the hue of photographs. The reference goes into the calibration in force.
+    Without it their hue is neutral. The reference goes into the calibration in force.
     """
     from services.workshop.calibration_words import details
     from services.workshop.check_head import with_archive

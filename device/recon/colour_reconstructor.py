@@ -74,7 +74,7 @@ class ColourReconstructor:
 
         `frames`: one frame of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason
         of each colour without a frame; `lights_dn_per_s` the light of each colour at full drive (`white_balance`), None
-        if it is not known: the hue is then that of photographs. `deadline` is also that of `green`; it moves by the
+        if it is not known: the hue is then neutral. `deadline` is also that of `green`; it moves by the
         time until the consumer continues after RoundDone. The picture is a ColourReconstruction if another colour was
         solved; its report lists every colour.
         """

@@ -1,8 +1,8 @@
 """White balance of a colour picture: the light of each colour over that of a white card in the same lamp light.
 
 The level of a solved channel says nothing about its colour: lamp, sensor and diffuser have their own response to each
-colour. The card divides them out. Without a card, the means of red and blue over that of green are those of
-photographs of the retina. NUMERICS.md 10.4.
+colour. The card divides them out. Without a card the hue is neutral: the means of red and blue over that of green are
+those that a card would give for an average retina. NUMERICS.md 10.4.
 """
 
 from collections.abc import Mapping
@@ -14,8 +14,8 @@ from device.recon.colour import RGB
 from device.recon.model.kernels import Pixels
 from device.values import Calibration, Colour, Image
 
-# Mean light of a colour over that of green: medians of the four photographs of NUMERICS.md 10.3, in linear light.
-OVER_GREEN: dict[Colour, float] = {"red": 11.6, "green": 1.0, "blue": 0.385}
+# Reflectance of a colour over that of green, mean of nasal fundus and perifovea (Delori and Pflibsen, OPTICS.md 4.1).
+OVER_GREEN: dict[Colour, float] = {"red": 3.61, "green": 1.0, "blue": 0.627}
 
 
 def light_dn_per_s(counts: Pixels, dark: Pixels | None, calibration: Calibration, full_drive_s: float) -> float:
@@ -49,7 +49,7 @@ def balanced(picture: Image, field: Image, ratios: Mapping[Colour, float]) -> Im
     """Return a picture (rows, cols, 3) with red and blue scaled to a ratio of their means over the field to green's.
 
     `field` is the lit field, (rows, cols) in 0..1. The wanted ratio of a colour is its value in `ratios` (light over
-    that of the white card) over the value of green; it is that of photographs, OVER_GREEN, if either value is missing.
+    that of the white card) over the value of green; it is that of an average retina, OVER_GREEN, if either is missing.
     Green stays as it is, and so does a channel without light; without light in green, red and blue become 0.
     """
     green = ratios.get("green")

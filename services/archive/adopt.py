@@ -16,7 +16,8 @@ from services.archive.plan import Plan, PlannedCapture, read_plan
 from services.archive.result import COLOUR_PICTURE, PICTURE, PLAN, ResultFolder, Stored, encoded_document
 from services.archive.solve import read_linear
 from services.errors import RecordNotFound, VersionRefused
-from services.imaging.picture_files import to_png
+from services.imaging.colour_rendering import render_colour
+from services.imaging.picture_files import DISPLAY, to_png
 from services.records import schema
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
@@ -115,7 +116,10 @@ def _adopt(
     except DiffuscopeError as error:
         raise SettingError(error.message, f"Remove {place}, and run the plan again.") from error
     note = f"{capture.eye} {capture.taken_at:%Y-%m-%d}, reconstructed again"
-    coloured = None if colour is None else to_png(colour, stored.simulated, note, stored.predicted)
+    coloured = None
+    if colour is not None:
+        colour = render_colour(colour)
+        coloured = to_png(colour, stored.simulated, note, stored.predicted, DISPLAY)
     at = clock.wall()
     store.versions.adopt(
         NewVersion(

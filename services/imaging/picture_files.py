@@ -29,14 +29,21 @@ _PREDICTED_TEXT = "predicted"  # text chunk
 _BROKEN_TIFF = (tifffile.TiffFileError, struct.error, zlib.error)  # exceptions of tifffile on truncated data
 _LOW, _HIGH = 0.5, 99.8  # percentiles of the lit pixels: noise below, reflections above
 _SAMPLES = 40_000  # error of the percentiles below a grey level, in 1 % of the time for all pixels
+DISPLAY = (0.0, 1.0)  # window of a picture that is rendered for the display already
 _BLACK_LIMIT = 1e-30  # a picture below this is black; a division by its range would overflow
 _SATURATED_SHARE = 0.05  # of the pixels of a block: the block is shown as saturated
 _STEPS = 4096  # in linear light, finer than 8 bits of sRGB anywhere (its slope is at most 12.92)
 _PREDICTED_RATIO = 1 / 32  # of the mark of predicted channels
 
 
-def to_png(picture: Image, simulated: bool, note: str = "", predicted: Sequence[str] = ()) -> bytes:
-    """Return an 8-bit sRGB PNG, windowed between percentiles 0.5 and 99.8 of the pixels that are not zero.
+def to_png(
+    picture: Image,
+    simulated: bool,
+    note: str = "",
+    predicted: Sequence[str] = (),
+    window: tuple[float, float] | None = None,
+) -> bytes:
+    """Return an 8-bit sRGB PNG; black and white are the values of `window`, None: those of `display_window`.
 
     `picture` is linear float32 (rows, cols) or (rows, cols, 3) and keeps its size; all channels share one window, which
     preserves neutral colours. A simulated picture carries a mark in its pixels and the text chunk `simulated`; `note`
@@ -44,7 +51,7 @@ def to_png(picture: Image, simulated: bool, note: str = "", predicted: Sequence[
     chunk `predicted`. Raises FrameError if any value is NaN or infinite.
     """
     _refuse_invalid_picture(picture)
-    pixels, texts = _display_pixels(picture), {}
+    pixels, texts = _display_pixels(picture, window), {}
     if predicted:
         texts = {_PREDICTED_TEXT: ", ".join(predicted)}
         pixels = with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, at_right=True)
@@ -59,7 +66,13 @@ def with_note(png: bytes, note: str) -> bytes:
         return png_bytes(np.asarray(image), simulated, texts, note, for_eyes=False)  # they have their marks
 
 
-def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int = 70) -> bytes:
+def to_jpeg(
+    picture: Image,
+    longest_side_px: int,
+    simulated: bool,
+    quality: int = 70,
+    window: tuple[float, float] | None = None,
+) -> bytes:
     """Return an 8-bit sRGB JPEG with the window and mark of `to_png`, never enlarged.
 
     Its longer side is at most `longest_side_px`; the reduction in linear light preserves the mean. Raises FrameError
@@ -69,7 +82,7 @@ def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int 
         raise SettingError(f"a picture {longest_side_px} px long, at quality {quality} of 1 to 95, cannot be made")
     _refuse_invalid_picture(picture)
     small = block_mean(picture, max(picture.shape[:2]) // longest_side_px)
-    image = Pillow.fromarray(_display_pixels(small))
+    image = Pillow.fromarray(_display_pixels(small, window))
     image.thumbnail(
         (longest_side_px, longest_side_px), Pillow.Resampling.BILINEAR
     )  # remaining reduction below a factor of two
@@ -120,9 +133,9 @@ def _refuse_invalid_picture(picture: Image) -> None:
         raise FrameError("the picture holds values that are not numbers (NaN or infinite)")
 
 
-def _display_pixels(picture: Image) -> Pixels:
-    """Return the 8-bit sRGB pixels of a linear picture, same shape, scaled to the window of `_window`."""
-    low, high = _window(picture)
+def _display_pixels(picture: Image, window: tuple[float, float] | None) -> Pixels:
+    """Return the 8-bit sRGB pixels of a linear picture, same shape, scaled to a window; None: `display_window`."""
+    low, high = window or display_window(picture)
     scaled = np.subtract(picture, low, dtype=np.float32)
     scaled *= np.float32((_STEPS - 1) / (high - low))
     np.clip(scaled, 0, _STEPS - 1, out=scaled)
@@ -131,8 +144,10 @@ def _display_pixels(picture: Image) -> Pixels:
     return pixels
 
 
-def _window(picture: Image) -> tuple[float, float]:
-    """Return the values shown as black and as white: percentiles of the pixels that are not zero; (0, 1) if all are.
+def display_window(picture: Image) -> tuple[float, float]:
+    """Return the values shown as black and as white: percentiles 0.5 and 99.8 of the pixels that are not zero.
+
+    (0, 1) if all are zero.
 
     A reconstruction is zero outside the illuminated disc; these pixels would make the window depend on its size.
     """

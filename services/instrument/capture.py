@@ -17,6 +17,7 @@ from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import PreparedFrame
 from device.values import EYES, Colour, Eye, Frame, Image, Report
 from services.imaging import picture_files
+from services.imaging.colour_rendering import render_colour
 from services.imaging.raw_metadata import RawMetadata
 from services.records.blobs import FileContent, WrittenFile
 from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, PictureVerdict
@@ -164,10 +165,14 @@ def capture_files(
     """
     note = f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
     predicted = [one.name for one in capture.report.reconstruction.channels if one.predicted]
+    coloured: dict[str, FileContent] = {}
+    if colour is not None:
+        colour = render_colour(colour)
+        coloured[COLOUR] = picture_files.to_png(colour, capture.simulated, note, predicted, picture_files.DISPLAY)
     return {
         **_frame_files(capture, head, shot),
         "picture.png": picture_files.to_png(shown, capture.simulated, note),
-        **({} if colour is None else {COLOUR: picture_files.to_png(colour, capture.simulated, note, predicted)}),
+        **coloured,
         "quick.jpg": quick or picture_files.to_jpeg(shown, QUICK_PX, capture.simulated),
         "report.json": as_json(report_as_json(capture.report) | {"simulated": capture.simulated}),
     }

@@ -91,7 +91,7 @@ def _press(
     picture = np.zeros((*made.picture.shape, 3), np.float32)
     picture[solved.box] = solved.colour
     if options.output is not None:
-        write_picture(options.output, picture, made.simulated)
+        write_picture(options.output, picture, made.simulated, is_joined=True)
     return replace(made, picture=picture)
 
 
@@ -180,7 +180,7 @@ def _joined(
     )
     solved = FileReconstruction(joined.picture, report, any(one.simulated for one in made.values()))
     if options.output is not None:
-        write_picture(options.output, solved.picture, solved.simulated)
+        write_picture(options.output, solved.picture, solved.simulated, is_joined=True)
     return solved
 
 

@@ -32,7 +32,8 @@ from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Recipe, Reconstructor, default_schedule, plane
 from device.recon.solvers.flat_field_correction import flat_field_correct
 from device.values import Calibration, Image, Reconstruction, Report
-from services.imaging.picture_files import to_png
+from services.imaging.colour_rendering import render_colour
+from services.imaging.picture_files import DISPLAY, to_png
 from services.research import sweep_plot
 from services.research.reconstruct_inputs import (
     LoadedPsfs,
@@ -505,9 +506,13 @@ def evenness_px(calibration: Calibration, shape: Shape) -> float:
     return 4 * calibration.geometry.px_per_deg if calibration.geometry else min(shape) / 8
 
 
-def write_picture(path: Path, picture: Image, simulated: bool) -> None:
-    """Write a linear picture by the ending of its path; StoreError, or StoreFull for a full disk."""
+def write_picture(path: Path, picture: Image, simulated: bool, *, is_joined: bool = False) -> None:
+    """Write a linear picture by the ending of its path; StoreError, or StoreFull for a full disk.
+
+    `is_joined`: it was joined from several colours of light, and is rendered as the instrument does for eyes.
+    """
     if path.suffix.lower() == ".png":
-        write_or_raise(path, lambda: path.write_bytes(to_png(picture, simulated)))
+        shown, window = (render_colour(picture), DISPLAY) if is_joined else (picture, None)
+        write_or_raise(path, lambda: path.write_bytes(to_png(shown, simulated, window=window)))
     else:
         write_or_raise(path, lambda: write_linear(path, picture, simulated))

@@ -124,7 +124,7 @@ CHANNEL: Mapping[str, JsonValue] = {
     "white_ratio": {
         "type": ["number", "null"],
         "description": "Light of its frame over that of a white card in the same lamp light. Null without a white "
-        "reference in the calibration: the hue is then that of photographs.",
+        "reference in the calibration: the hue is then neutral, that of an average retina.",
     },
 }
 VERDICT: Mapping[str, str] = {

@@ -140,7 +140,7 @@ def test_what_is_no_white_card_is_refused_with_its_remedy(frames: dict[Colour, C
 def test_the_means_of_a_balanced_picture_are_those_of_the_card(
     red: float, green: float, level: float, means: tuple[float, float, float]
 ) -> None:
-    """For any level of the solved channels; blue, which was not taken, keeps the hue of photographs."""
+    """For any level of the solved channels; blue, which was not taken, keeps the hue of an average retina."""
     field = np.zeros((8, 8), np.float32)
     field[2:6, 2:6] = 1
     picture = (np.array(means) * np.ones((8, 8, 3))).astype(np.float32)
@@ -151,7 +151,7 @@ def test_the_means_of_a_balanced_picture_are_those_of_the_card(
 
 
 @pytest.mark.parametrize("shares", [{}, {"red": 0.3}])
-def test_without_a_card_the_hue_is_that_of_photographs(shares: dict[Colour, float]) -> None:
+def test_without_a_card_the_hue_is_that_of_an_average_retina(shares: dict[Colour, float]) -> None:
     made = balanced(np.ones((4, 4, 3), np.float32), np.ones((4, 4), np.float32), shares)
     assert made.mean(axis=(0, 1)) == pytest.approx([OVER_GREEN[colour] for colour in RGB])
 

@@ -103,8 +103,7 @@ class ChannelAnswer(StoredPart):
     """One colour of light: its shift from green (rows, cols; pixels), whether it is predicted, not measured.
 
     `reason`: why the picture has not this colour; null for one that it has. `white_ratio`: its light over that of a
-    white card; only with a white reference, else the hue is that of photographs. File `raw-red.tiff` is the raw
-    frame of red.
+    white card; only with a white reference, else the hue is neutral. File `raw-red.tiff` is the raw frame of red.
     """
 
     name: Colour
