@@ -98,11 +98,14 @@ class ExamEvents:
         self._requests.show(replace(self.output, preview=Preview(number, jpeg, exposed_s, aim)))
 
     def problem(self, error: DiffuscopeError | None) -> None:
-        """Show the error of the last live picture, None if there is none; publish it if its code has changed."""
+        """Show the error of the last live picture, or the one for which a capture waits; None if there is none.
+
+        It is published if its code has changed.
+        """
         before = self.output.problem
         self._requests.show(replace(self.output, problem=error))
         if error is not None and error.code != (before.code if before else None):
-            log.warning("no live picture: %s", error, extra={"code": error.code})
+            log.warning("no picture now: %s", error, extra={"code": error.code})
             self._event_bus.publish("failed", code=error.code, message=error.message, remedy=error.remedy)
 
     def ended(self, problem: DiffuscopeError | None, failure: DiffuscopeError | None) -> None:

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 
-from device.clock import Clock
-from device.errors import DiffuscopeError, FrameError, LightFault, StoreError
+from device.clock import Clock, Deadline
+from device.errors import DiffuscopeError, FrameError, LightFault, StoreError, StoreFull, StoreReadOnly
 from device.head import Head
 from device.recon.reconstructor import RoundDone, StageResult
 from device.values import Reconstruction
-from services.errors import Busy, RequestRefused
+from services.errors import Busy, RequestRefused, StoreDamaged, StoreLocked
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.background import run_in_thread
 from services.instrument.calibration_monitor import CalibrationMonitor
@@ -41,6 +41,9 @@ from services.records.capture_store import CaptureStore
 log = logging.getLogger(__name__)
 
 LIVE_S = 0.4  # interval of progress events and of live pictures during a refinement
+LOCK_PATIENCE_S = 45.0  # for a locked database; the request that finishes a visit waits longer (pending_captures.py)
+REFUSALS = (StoreFull, StoreLocked, StoreReadOnly, StoreDamaged)  # of the store: what it refuses can be stored later
+POSTPONED = "The frames of this picture are kept: the picture is made at the next start of the instrument."
 
 
 @dataclass(frozen=True)
@@ -211,15 +214,15 @@ class ExamLoop:
     def _resolving(self, press: Press, id: str, on_error: ExamEvent) -> Iterator[None]:
         """Turn the lamp off at exit; on an error, apply the event `on_error` to the state and fail the press's future.
 
-        A DiffuscopeError is also published on the event bus. Another exception is raised again; its journal entry
-        and frames stay, so that the next start resumes the capture. LightFault if the lamp cannot be turned off.
+        A DiffuscopeError is also published on the event bus. Journal entry and frames stay, so that the next start
+        resumes the capture, after a refusal of the store that may end, and after an exception of another kind, which
+        is raised again. LightFault if the lamp cannot be turned off.
         """
         try:
             yield
-        except DiffuscopeError as error:
+        except DiffuscopeError as raised:
+            error = _end_or_postpone(self._parts.capture_journal, id, raised)
             self._events.failed(id, error)
-            with suppress(StoreError):  # then the next start reports the capture as interrupted
-                self._parts.capture_journal.fail(id)
             self._requests.advance(on_error)
             self._events.state()
             press.future.set_exception(error)
@@ -244,9 +247,12 @@ class ExamLoop:
         record = self._pipeline.record(shot, made, verdict, budget_s)
         self._events.stage(shot.press, shot.id, "keep")
         quick, target = self._events.output.quick_looks.get(shot.id), shot.press.target
-        kept = run_in_thread(
-            lambda: self._parts.store.save(record.capture, record.files(quick), target.write_rows, target.request),
+        files, deadline = record.files(quick), Deadline.after(self._parts.clock, LOCK_PATIENCE_S)
+        kept = _when_unlocked(
+            lambda: self._parts.store.save(record.capture, files, target.write_rows, target.request),
             lambda: self._serve_between_rounds(shot),
+            lambda: not self._requests.snapshot.is_closing and deadline.left_s() > 0,
+            self._events.problem,
         )
         self._events.kept(shot.id)
         took_s, method = kept.report.total_s, made.report.method
@@ -278,6 +284,7 @@ class ExamLoop:
             self._expose_during_refinement()
         elif self._parts.clock.now_s() - self._last_update_s > LIVE_S:
             self._last_update_s = self._parts.clock.now_s()
+            self._parts.watchdog.beat()
             self._events.progress(shot.press, shot.id)
             if self._last_update_s < self._requests.snapshot.live_until_s:
                 self._live.refresh()
@@ -301,6 +308,40 @@ def _end_journal_entry(journal: CaptureJournal, id: str, key: str | None = None)
     """Remove a capture from the journal; with `key`, also interrupted captures of that key."""
     with suppress(StoreError):  # then the next start reports the capture as interrupted, or finds it in the store
         journal.end(id, key)
+
+
+def _end_or_postpone(journal: CaptureJournal, id: str, error: DiffuscopeError) -> DiffuscopeError:
+    """Postpone a capture in the journal after a refusal of the store, else end it there; return the error to show.
+
+    The error of a capture that is postponed says so.
+    """
+    is_postponed = False
+    with suppress(StoreError):  # then the next start reports the capture as interrupted
+        if isinstance(error, REFUSALS):
+            is_postponed = journal.postpone(id)
+        else:
+            journal.fail(id)
+    return type(error)(error.message, f"{error.remedy} {POSTPONED}") if is_postponed else error
+
+
+def _when_unlocked(
+    save: Callable[[], Capture],
+    keep_alive: Callable[[], None],
+    may_wait: Callable[[], bool],
+    report: Callable[[StoreLocked], None],
+) -> Capture:
+    """Run `save` in a thread, and again while another program locks the database and `may_wait`; return the capture.
+
+    The light has been given: the picture waits for the other program. Each attempt waits for the lock as every writer
+    does; `report` is called with its error after it, `keep_alive` as in `run_in_thread`.
+    """
+    while True:
+        try:
+            return run_in_thread(save, keep_alive)
+        except StoreLocked as error:
+            if not may_wait():
+                raise
+            report(error)
 
 
 def run_exam(

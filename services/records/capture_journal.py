@@ -146,6 +146,22 @@ class CaptureJournal:
         self.interrupted = (*self.interrupted, resumed)
         self._remove_frames(id)
 
+    def postpone(self, id: str) -> bool:
+        """Keep the frames of a capture that the store refused, for the next start; True if at least one is lit.
+
+        Without a lit frame on the disk, as `fail`. The attempt does not count. StoreError if the disk refuses.
+        """
+        folder = self._folder / id
+        if (writer := self._writers.pop(id, None)) is not None:
+            writer.close(complete=True)
+        if not any(one.is_lit for one in stored_frames(folder)):
+            self.fail(id)
+            return False
+        with storage_errors():
+            for attempt in folder.glob(_ATTEMPT.format("*")):
+                attempt.unlink()
+        return True
+
     def discard(self, is_handled: Callable[[InterruptedCapture], bool]) -> None:
         """Remove the captures for which `is_handled` is true from `interrupted`, and delete their entries."""
         discarded = [one for one in self.interrupted if is_handled(one)]

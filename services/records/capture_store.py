@@ -58,7 +58,7 @@ from services.records.restoration import finish_restoration
 from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
 from services.records.snapshots import Snapshots
-from services.records.storage_errors import is_disk_full, storage_errors
+from services.records.storage_errors import is_disk_full, is_locked, storage_errors
 from services.records.store_space import FreeSpace, StoreSpace
 from services.records.write_ahead_log import WriteAheadLog
 
@@ -142,9 +142,9 @@ class CaptureStore:
         `write_rows` adds rows in the same transaction. `request`: reference of the press, as
         `IdempotentRequests.reference` returns it, stored in the record of the capture. Quarantined captures are deleted
         if their space is needed; files that are on the disk already are linked.
-        Errors: StoreFull (everything written is removed); StoreError (the id exists; or a write failed: the next
-        opening quarantines the folder if it is incomplete and has no row); SettingError (invalid id, file name or
-        report, or no files).
+        Errors: StoreFull, StoreLocked (everything written is removed); StoreError (the id exists; or a write failed:
+        the next opening quarantines the folder if it is incomplete and has no row); SettingError (invalid id, file name
+        or report, or no files).
         """
         _refuse_names(capture.id, files)
         capture = capture.with_files({name: _sha256(content) for name, content in files.items()})
@@ -159,7 +159,7 @@ class CaptureStore:
             self._refuse_duplicate(part, kept)
             schema.refuse_if_read_only(self.engine)
             self.space.make_room(new_bytes, len(files) + 1)
-            with _removed_when_full(part, kept):
+            with _removed_when_refused(part, kept):
                 blobs.write_folder(part, files)
                 atomic_io.replace_durably(part, kept)
                 with _renamed_back_when_refused(kept, part), recorded(self.engine) as session:
@@ -352,8 +352,8 @@ def _renamed_back_when_refused(kept: Path, part: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _removed_when_full(*folders: Path) -> Iterator[None]:
-    """Remove the given folders if the block fails because the disk is full; a context manager.
+def _removed_when_refused(*folders: Path) -> Iterator[None]:
+    """Remove the given folders if the block fails on a full disk or a locked database; a context manager.
 
     After any other error the folders stay until the next opening, which looks for the row: a commit that failed in its
     last step may still have reached the disk.
@@ -361,7 +361,7 @@ def _removed_when_full(*folders: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, DBAPIError) as error:
-        if is_disk_full(error):
+        if is_disk_full(error) or is_locked(error):
             for folder in folders:
                 shutil.rmtree(folder, ignore_errors=True)  # a folder that stays has no row and is quarantined
         raise

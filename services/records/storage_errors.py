@@ -32,6 +32,11 @@ def is_disk_full(error: OSError | DBAPIError) -> bool:
     return atomic_io.is_full(error) if isinstance(error, OSError) else sqlite_name(error.orig) == "SQLITE_FULL"
 
 
+def is_locked(error: OSError | DBAPIError) -> bool:
+    """Return whether the error means that another program holds the lock of the database: nothing was committed."""
+    return isinstance(error, DBAPIError) and _sqlite_kind(error.orig) is StoreLocked
+
+
 def sqlite_name(error: BaseException | None) -> str:
     """Return SQLite's name of an error such as "SQLITE_FULL"; "" for an error of the driver, which has none."""
     return getattr(error, "sqlite_errorname", "")

@@ -17,6 +17,7 @@ from device.values import ExposureSettings, Frame, Illumination
 from services.errors import ConsentDeclined
 from services.instrument.capture_pipeline import INTERRUPTED
 from services.instrument.resumption import CALIBRATION_DARK, NO_DARK, SHORTER, WHOLE
+from services.records.capture_journal import MAX_ATTEMPTS
 from services.records.capture_target import CaptureTarget
 from services.records.protocol import load_protocol
 from services.records.visit_repository import VisitRepository
@@ -165,17 +166,23 @@ def test_frames_of_a_patient_who_has_declined_since_are_deleted(
         assert list((rig.store.folder / "underway").iterdir()) == []
 
 
-def test_frames_that_cannot_be_stored_leave_an_interrupted_capture(
+def test_frames_that_a_full_disk_refuses_wait_for_a_start_with_room(
     build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path
 ) -> None:
     before = interrupt(3)
+    for _ in range(MAX_ATTEMPTS):
+        with ExitStack() as undo:
+            rig = build(tmp_path, undo, store={"free_bytes": lambda _: 0})
+            with pytest.raises(StoreFull):
+                rig.exam.press("OD", KEY, before.target).result(60)
+            assert rig.exam.capture_journal.interrupted == ()
+            assert written(rig.store.folder) == before.frames
+            assert rig.world.illumination is None
     with ExitStack() as undo:
-        rig = build(tmp_path, undo, store={"free_bytes": lambda _: 0})
-        with pytest.raises(StoreFull):
-            rig.exam.press("OD", KEY, before.target).result(60)
-        assert [one.slot for one in rig.exam.capture_journal.interrupted] == ["R-centre"]
-        assert [path.suffix for path in (rig.store.folder / "underway").iterdir()] == [".json"]
-        assert rig.world.illumination is None
+        rig = build(tmp_path, undo)
+        kept = rig.exam.press("OD", KEY, before.target).result(60)
+        assert set(before.frames) <= set(kept.files)
+        assert rig.world.frames == 0, "nothing is exposed again"
 
 
 @pytest.mark.timeout(600)

@@ -51,7 +51,7 @@ from services.instrument.capture import LiveRequest, Press
 from services.instrument.capture_pipeline import CapturePipeline
 from services.instrument.events import EventBus
 from services.instrument.exam_events import ExamEvents
-from services.instrument.exam_loop import ExamParts, run_exam
+from services.instrument.exam_loop import REFUSALS, ExamParts, run_exam
 from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import ExamState
 from services.instrument.frame_feedback import NO_AIM
@@ -408,9 +408,9 @@ class Run:
                 self._check_stored(future.result(0), store)
         self.done["stored"] += sum(future.done() and future.exception(0) is None for future in self.futures)
         self.done["resumed"] += sum(future.done() and future.exception(0) is None for future in self.resumed)
-        cut_off = sum(is_cut_off(future) for future in (*self.lit, *self.resumed))
+        left = sum(is_left_for_later(future) for future in (*self.lit, *self.resumed))
         on_disk = len(list(store.folder.glob("underway/*/raw.tiff.json")))
-        self._require(on_disk == cut_off, f"{on_disk} presses have frames on the disk, and {cut_off} were cut off")
+        self._require(on_disk == left, f"{on_disk} presses have frames on the disk, and {left} were left for later")
 
     def _check_stored(self, capture: Capture, store: CaptureStore) -> None:
         self._require(store.get(capture.id) == capture, "an acknowledged capture is not stored as it was answered")
@@ -525,10 +525,10 @@ class Run:
         self._require(before.state.accepts_press and not before.is_closing, "a press is accepted that must be refused")
 
 
-def is_cut_off(future: Future[Capture]) -> bool:
-    """Return whether a press ended with the exam: its frames stay on the disk."""
+def is_left_for_later(future: Future[Capture]) -> bool:
+    """Return whether a press ended with the exam, or was refused by the store: its frames stay on the disk."""
     error = future.exception(0) if future.done() else None
-    return error is not None and (isinstance(error, Busy) or "stopped unexpectedly" in str(error))
+    return error is not None and (isinstance(error, (Busy, *REFUSALS)) or "stopped unexpectedly" in str(error))
 
 
 @dataclass
