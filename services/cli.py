@@ -29,8 +29,7 @@ from services.research.montage_files import montage_files, placed_lines
 from services.research.named_files import head_file, scene_file
 from services.research.peers import ENVIRONMENT, installed_peer
 from services.research.psf_stack import psf_stack
-from services.research.reconstruct_burst import reconstruct_burst
-from services.research.reconstruct_colour import reconstruct_colours
+from services.research.reconstruct_burst import reconstruct_burst, reconstruct_colours
 from services.research.reconstruct_each import reconstruct_each
 from services.research.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
 from services.research.reconstruct_inputs import ReconstructOptions

@@ -32,7 +32,6 @@ from device.recon.reconstructor import (
     RoundDone,
     default_schedule,
     plane,
-    without_sensor,
 )
 from device.values import Calibration, FrameUse, Image
 
@@ -47,12 +46,11 @@ class JoinedFrame:
     """A burst as one frame: linear DN above dark, (rows, cols) float32, NaN where too few frames saw the pixel.
 
     `light` is a ratio: the sum of the light of the used frames over that of the first used one, the reference.
-    `calibration` holds for it: its gain is that of the sum of the light. `frames` has one entry per frame.
+    `frames` has one entry per frame.
     """
 
     counts: Image
     light: float
-    calibration: Calibration
     frames: tuple[FrameUse, ...]
 
 
@@ -197,19 +195,4 @@ class BurstJoiner:
         kernels.finish_mean(joined, weights, LEAST_WEIGHT, base, base_scale)
         light = total_dn / reference.mean_dn
         frames = tuple(replace(one, weight=shares.get(one.index, 0.0)) for one in uses)
-        return JoinedFrame(joined, light, joined_calibration(self._calibration, light, len(used)), frames)
-
-
-def joined_calibration(calibration: Calibration, light: float, count: int) -> Calibration:
-    """Return the calibration of a joined frame of `count` frames with `light` times the light of the reference.
-
-    Averaged counts hold `light` times the electrons per count; the read noise is sqrt(`count`) times that of one.
-    """
-    linear = without_sensor(calibration)
-    gain, read_e = linear.sensor.gain_e_per_dn, linear.sensor.read_noise_e
-    joined = replace(
-        linear.sensor,
-        gain_e_per_dn=None if gain is None else gain * light,
-        read_noise_e=None if read_e is None else read_e * count**0.5,
-    )
-    return replace(linear, sensor=joined)
+        return JoinedFrame(joined, light, frames)

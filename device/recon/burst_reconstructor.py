@@ -81,6 +81,7 @@ class BurstReconstructor:
         deadline: Deadline | None = None,
         unusable: Mapping[int, str] | None = None,
         prepared: Mapping[int, PreparedFrame] | None = None,
+        refract: bool = True,
     ) -> Iterator[Step]:
         """Yield the quick look of the first frame, RoundDone after each frame and round, and the picture of the burst.
 
@@ -88,14 +89,14 @@ class BurstReconstructor:
         frame that must not enter the picture, by its index, never the first; `prepared` the frames that are prepared
         with this dark frame, by index. The deadline moves by the time until the consumer continues after RoundDone. A
         burst of one usable frame gives the picture of that frame; a deadline that leaves no time to join them gives
-        that of the first. FrameError for another shape, for a first frame with too many missing pixels for a quick
-        look, or if no frame can be used.
+        that of the first. Without `refract` the PSF is that of the picture before. FrameError for another shape, for a
+        first frame with too many missing pixels for a quick look, or if no frame can be used.
         """
-        run, ready = _Run(self, deadline), dict(prepared or {})
+        run, ready = _Run(self, deadline, refract), dict(prepared or {})
         tasks = {k: one.refraction for k, one in ready.items()}
         if len(frames) == 1:
             yield from self.single.steps(
-                frames[0], dark, simulated=simulated, deadline=deadline, refraction=tasks.get(0)
+                frames[0], dark, simulated=simulated, deadline=deadline, refract=refract, refraction=tasks.get(0)
             )
             return
         saturated = yield from self._quick_look(frames[0], dark, ready.get(0), simulated)
@@ -139,8 +140,8 @@ class BurstReconstructor:
 class _Run:
     """State of the reconstruction of one burst: its deadline, the duration of joining, and the joined frame."""
 
-    def __init__(self, owner: "BurstReconstructor", deadline: Deadline | None) -> None:
-        self._owner, self._deadline = owner, deadline
+    def __init__(self, owner: "BurstReconstructor", deadline: Deadline | None, refract: bool = True) -> None:
+        self._owner, self._deadline, self._refract = owner, deadline, refract
         self.joined: JoinedFrame | None = None
         self._join_s = 0.0
 
@@ -188,6 +189,7 @@ class _Run:
             simulated=simulated,
             deadline=self._deadline,
             joined=total,
+            refract=self._refract,
             refraction=refraction,
             others=used[1:],
         ):
@@ -217,7 +219,12 @@ class _Run:
         `refraction`: its task, if it has begun.
         """
         for step in self._owner.single.steps(
-            counts, dark, simulated=simulated, deadline=self._deadline, refraction=refraction
+            counts,
+            dark,
+            simulated=simulated,
+            deadline=self._deadline,
+            refract=self._refract,
+            refraction=refraction,
         ):
             if isinstance(step, Reconstruction):
                 yield self._reported(step, only(index, uses))

@@ -1,21 +1,23 @@
-"""Colour pictures of an instrument: other colours of light, solved after the picture in green and joined to it.
+"""Colour pictures: other colours of light, solved after the picture in the first one (green) and joined to it.
 
 The picture in green is made first, and as if there were no other colour. What is left of the time budget is for the
 others: each is solved with its own PSF, stretched as green's was for the refraction of the eye, and joined to green on
-green's grid (`colour`). NUMERICS.md 10.4.
+green's grid (`colour`). NUMERICS.md 10.4. Raw files without a green one have another first colour, `reference`.
 """
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import inf, isfinite
 
 import numpy as np
 
 from device.clock import Deadline
 from device.errors import FrameError
+from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour import ColourPicture, join_colours
 from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, picture_otf, transform
-from device.recon.model.field_of_view import field_box, field_radius_px
-from device.recon.model.grid import disc
+from device.recon.model.field_of_view import field_box, field_radius_px, lit_field
+from device.recon.model.grid import Grid, disc
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
 from device.recon.white_balance import balanced, white_ratios
@@ -29,40 +31,53 @@ NOT_REGISTERED = "{} could not be registered: no shift matches better than chanc
 class ColourReconstruction(Reconstruction):
     """Reconstruction in green with a picture in colour.
 
-    `colour`: linear float32 (rows, cols, 3), red, green and blue, cropped to the illuminated field.
+    `colour`: linear float32 (rows, cols, 3), red, green and blue, cropped to the illuminated field. `others`: report of
+    each other colour.
     """
 
     colour: Image
+    others: Mapping[Colour, Report]
 
 
 class ColourReconstructor:
     """Solution of the frames in the other colours of light, and their joining to the picture in green.
 
-    `green` is the reconstructor of the pictures in green, `others` that of each other colour: with the PSF of that
-    colour, or `green` itself where one PSF holds for any colour. Between two steps they may make quick looks of other
-    frames. Not thread-safe.
+    `green` is the reconstructor of the pictures in green, or in the light `reference`; `others` that of each other
+    colour: with the PSF of that colour, or `green` itself where one PSF holds for any colour; one of bursts where there
+    are several frames. Between two steps they may make quick looks of other frames. `timed`: the cost of joining is
+    measured on noise, for deadlines. Not thread-safe.
     """
 
-    def __init__(self, green: Reconstructor, others: Mapping[Colour, Reconstructor]) -> None:
+    def __init__(
+        self,
+        green: Reconstructor,
+        others: Mapping[Colour, Reconstructor | BurstReconstructor],
+        *,
+        reference: Colour = "green",
+        timed: bool = True,
+    ) -> None:
         calibration, shape = green.calibration, green.shape
-        self._calibration = calibration
+        self._calibration, self._reference = calibration, reference
         self.others, self.clock, self.join_cost = others, green.clock, DurationEstimate()
+        self.singles = {
+            colour: one.single if isinstance(one, BurstReconstructor) else one for colour, one in others.items()
+        }
         self._otfs = {
             colour: InterpolatedOtf(one.calibration.psfs[one.psf_index])
-            for colour, one in others.items()
+            for colour, one in self.singles.items()
             if one is not green
         }
         self.box = field_box(calibration, shape)
         radius_px, middle = field_radius_px(calibration), ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
-        self._field = disc(shape, middle, radius_px)[self.box]
-        if others:
+        self._field = disc(shape, middle, radius_px)[self.box] if isfinite(radius_px) else None
+        if others and timed:
             noise = np.random.default_rng(0).random(shape, np.float32)
-            self._join({"green": noise, **dict.fromkeys(others, noise)}, 1, {})  # measures the cost
+            self._join({reference: noise, **dict.fromkeys(others, noise)}, 1, {})  # measures the cost
 
     def steps(
         self,
         green: Iterator[Step],
-        frames: Mapping[Colour, Pixels],
+        frames: Mapping[Colour, Sequence[Pixels]],
         dark: Pixels | None = None,
         *,
         simulated: bool,
@@ -72,8 +87,8 @@ class ColourReconstructor:
     ) -> Iterator[Step]:
         """Yield the steps of `green`, RoundDone after each round of the other colours, and the picture in colour.
 
-        `frames`: one frame of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason
-        of each colour without a frame; `lights_dn_per_s` the light of each colour at full drive (`white_balance`), None
+        `frames`: those of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason of
+        each colour without a frame; `lights_dn_per_s` the light of each colour at full drive (`white_balance`), None
         if it is not known: the hue is then neutral. `deadline` is also that of `green`; it moves by the
         time until the consumer continues after RoundDone. The picture is a ColourReconstruction if another colour was
         solved; its report lists every colour.
@@ -81,8 +96,8 @@ class ColourReconstructor:
         run = _Run(self, deadline)
         made = yield from run.green(green)
         eye = psf_wavefront(made.report, self._calibration.geometry)
-        pictures: dict[Colour, Image] = {"green": made.picture}
-        reasons = dict(missing or {})
+        pictures: dict[Colour, Image] = {self._reference: made.picture}
+        others, reasons = dict[Colour, Report](), dict(missing or {})
         for colour, counts in frames.items():
             try:
                 solved = yield from run.solve(colour, counts, dark, eye)
@@ -92,10 +107,10 @@ class ColourReconstructor:
             if solved is None:
                 reasons[colour] = NO_TIME
             else:
-                pictures[colour] = solved
+                pictures[colour], others[colour] = solved.picture, solved.report
         gone = tuple(ChannelUse(colour, None, reason=reason) for colour, reason in reasons.items())
         if len(pictures) == 1:
-            yield replace(made, report=replace(made.report, channels=(ChannelUse("green", (0.0, 0.0)), *gone)))
+            yield replace(made, report=replace(made.report, channels=(ChannelUse(self._reference, (0.0, 0.0)), *gone)))
             return
         begin_s = self.clock.now_s()
         joined = self._join(pictures, made.report.bin, lights_dn_per_s or {})
@@ -104,17 +119,24 @@ class ColourReconstructor:
         report = replace(
             made.report, seconds=seconds, channels=(*joined.channels, *gone), warnings=(*made.report.warnings, *notes)
         )
-        yield ColourReconstruction(made.picture, report, made.simulated or simulated, joined.picture)
+        yield ColourReconstruction(made.picture, report, made.simulated or simulated, joined.picture, others)
 
     def _join(self, pictures: Mapping[Colour, Image], n: int, lights_dn_per_s: Mapping[Colour, float]) -> ColourPicture:
-        """Return the channels, joined on the lit field only and balanced by the white reference."""
+        """Return the channels, joined on the lit field only and balanced by the white reference.
+
+        A field that is not calibrated is found in the picture of the reference.
+        """
         begin_s = self.clock.now_s()
         cropped: dict[Colour, Image] = {
             name: np.ascontiguousarray(picture[self.box]) for name, picture in pictures.items()
         }
-        joined, ratios = join_colours(cropped, self._field, n), white_ratios(self._calibration, lights_dn_per_s)
+        field = self._field
+        if field is None:
+            reference = cropped[self._reference]
+            field = lit_field(reference, Grid.periodic((reference.shape[0], reference.shape[1]), 1, inf))
+        joined, ratios = join_colours(cropped, field, n), white_ratios(self._calibration, lights_dn_per_s)
         channels = tuple(replace(one, white_ratio=ratios.get(one.name)) for one in joined.channels)
-        picture = balanced(joined.picture, self._field, ratios)
+        picture = balanced(joined.picture, field, ratios)
         self.join_cost.add(self.clock.now_s() - begin_s)
         return replace(joined, picture=picture, channels=channels)
 
@@ -125,7 +147,7 @@ class ColourReconstructor:
         """
         if colour not in self._otfs:
             return
-        stage = self.others[colour].stages[-1]
+        stage = self.singles[colour].stages[-1]
         otf = stage.model.stored
         if eye is not None and self._calibration.geometry is not None:
             otf = picture_otf(self._otfs[colour], stage.model, transform(self._calibration.geometry, *eye))
@@ -158,29 +180,33 @@ class _Run:
         raise AssertionError("a reconstruction ends with a picture")
 
     def solve(
-        self, colour: Colour, counts: Pixels, dark: Pixels | None, eye: Wavefront | None
-    ) -> Generator[Step, None, Image | None]:
+        self, colour: Colour, frames: Sequence[Pixels], dark: Pixels | None, eye: Wavefront | None
+    ) -> Generator[Step, None, Reconstruction | None]:
         """Yield RoundDone after each round of one colour, and return its picture; its PSF is that of `eye`.
 
-        None if no time is left for it. FrameError for a useless frame.
+        None if no time is left for it. FrameError for useless frames.
         """
         owner = self._owner
         one, join_s = owner.others[colour], owner.join_cost.seconds
-        first = one.stages[0]
+        first = owner.singles[colour].stages[0]
         if not self._fits(join_s + first.start_cost.seconds + first.finish_cost.seconds):
             owner.join_cost.halve_maximum()
             return None
         begin_s = owner.clock.now_s()
         owner.refocus(colour, eye)
         deadline = None if self._deadline is None else self._deadline.later(-join_s)
-        for step in one.steps(counts, dark, simulated=True, deadline=deadline, refract=False):
+        if isinstance(one, BurstReconstructor):
+            steps = one.steps(frames, dark, simulated=True, deadline=deadline, refract=False)
+        else:
+            steps = one.steps(frames[0], dark, simulated=True, deadline=deadline, refract=False)
+        for step in steps:
             if isinstance(step, RoundDone):
                 paused_s = owner.clock.now_s()
                 yield from self._passed_on(step)
                 begin_s += owner.clock.now_s() - paused_s
             elif isinstance(step, Reconstruction):
                 self.spent_s += owner.clock.now_s() - begin_s
-                return step.picture
+                return step
         raise AssertionError("a reconstruction ends with a picture")
 
     def _fits(self, cost_s: float) -> bool:

@@ -37,9 +37,8 @@ from services.research.reconstruct_capture import (
     CaptureReconstruction,
     CaptureReconstructor,
     frames_of_capture,
-    stated_by,
 )
-from services.research.reconstruct_inputs import ReconstructOptions
+from services.research.reconstruct_inputs import ReconstructOptions, stated_by
 
 KEPT_SOLVERS = 2  # captures come sorted by calibration; a solver takes up to about 300 MB at full sensor size
 EFFORT = "FFTW_ESTIMATE"  # plans by rule, not by measurement: two processes add in the same order
@@ -178,11 +177,12 @@ class Solvers:
         key = task.calibration.digest, digest_of(task.settings.model_dump())  # a worker may outlive a plan
         if key not in self._kept:
             options = self._calibrations.options(task.calibration, task.settings)
-            colour_psfs: dict[Colour, tuple[Path, ...]] = {}
-            for colour, role in COLOUR_ROLES.items():
-                if paths := self._calibrations.paths(task.calibration, role):
-                    colour_psfs[colour] = paths
-            self._kept[key] = CaptureReconstructor(options, self._planner, colour_psfs)
+            of_colours: dict[Colour, ReconstructOptions] = {
+                colour: replace(options, psfs=paths)
+                for colour, role in COLOUR_ROLES.items()
+                if (paths := self._calibrations.paths(task.calibration, role))
+            }
+            self._kept[key] = CaptureReconstructor(options, self._planner, of_colours)
             while len(self._kept) > KEPT_SOLVERS:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
@@ -199,11 +199,11 @@ class _Made:
 def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
     """Return copies of all frames of a capture, whose contents have the planned digests; errors as in `_copied`."""
     lit = [_copied(capture.raw, capture.raw_sha256, spool / "raw")]
-    colours, unusable = dict[Colour, Path](), dict[int, str]()
+    colours, unusable = dict[Colour, list[Path]](), dict[int, str]()
     for one in capture.frames:
         copy = _copied(one.path, one.sha256, spool / "raw")
         if one.colour:
-            colours[one.colour] = copy
+            colours.setdefault(one.colour, []).append(copy)
         else:
             unusable |= {len(lit): one.unusable} if one.unusable else {}
             lit.append(copy)

@@ -119,7 +119,7 @@ class ColoursReconstructor(Protocol):
     def steps(
         self,
         green: Iterator[Step],
-        frames: Mapping[Colour, Pixels],
+        frames: Mapping[Colour, Sequence[Pixels]],
         dark: Pixels | None = None,
         *,
         simulated: bool,
@@ -352,7 +352,7 @@ class CapturePipeline:
             )
         if self.colours is None or not (shot.colours or shot.missing):
             return green
-        colours = {colour: frame.counts for colour, frame in shot.colours.items()}
+        colours = {colour: [frame.counts] for colour, frame in shot.colours.items()}
         if shot.dark is not None:
             dark_s = shot.dark.exposure_s
             dark = dark if all(dark_fits(one.exposure_s, dark_s) for one in shot.colours.values()) else None

@@ -98,11 +98,7 @@ def common_raw(usable: Sequence[LoadedRaw]) -> LoadedRaw:
             "Give the raws of each colour with its PSF: --channel NAME RAW PSF.",
         )
     for one in usable[1:]:
-        if (one.shape, one.channels) != (first.shape, first.channels):
-            raise FrameError(
-                f"{one.name} has {_size(one)}, {first.name} {_size(first)}",
-                "Give the raws of one burst, in one and the same camera mode.",
-            )
+        refuse_other_size(one, first)
         if _storage(one) != _storage(first):
             raise FrameError(
                 f"{one.name} is stored in another way than {first.name}: other levels, or other types of numbers",
@@ -110,6 +106,15 @@ def common_raw(usable: Sequence[LoadedRaw]) -> LoadedRaw:
             )
     white_dn = common_white_dn([one.raw for one in usable])
     return replace(first, raw=replace(first.raw, white_dn=white_dn, bad=np.zeros(first.solved_shape, np.bool_)))
+
+
+def refuse_other_size(one: LoadedRaw, first: LoadedRaw) -> None:
+    """Raise FrameError for a frame with another size, or number of channels, than the first of its capture."""
+    if (one.shape, one.channels) != (first.shape, first.channels):
+        raise FrameError(
+            f"{one.name} has {_size(one)}, {first.name} {_size(first)}",
+            "Give the raws of one capture, in one and the same camera mode.",
+        )
 
 
 def _storage(raw: LoadedRaw) -> tuple[object, ...]:

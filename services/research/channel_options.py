@@ -12,7 +12,7 @@ from typer.core import TyperCommand
 
 from device.errors import SettingError
 from device.recon.colour import CHANNELS
-from services.research.reconstruct_colour import ChannelSource
+from services.research.reconstruct_burst import ChannelSource
 
 SEPARATOR = "\0"  # no path holds it
 CHANNEL_REMEDY = "Give --channel NAME RAW PSF, as in --channel green raw.npy psf.npy."

@@ -1,16 +1,42 @@
-"""`diffuscope reconstruct RAW RAW ...`: one picture of a burst, several frames of one eye in one light."""
+"""`diffuscope reconstruct RAW RAW ...` and `--channel NAME RAW [PSF] ...`: one picture of several frames of one eye.
+
+Both are made as the picture of a press: a burst in one light, and frames in other colours.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from device.errors import SettingError
+import numpy as np
+
+from device.errors import FrameError, SettingError
 from device.recon.burst import MOST_FRAMES
-from device.recon.model.fft_plans import Planner
+from device.recon.colour import CHANNELS
 from device.values import Colour
 from services.research.burst_frames import refuse_psfs, refuse_repeated, refuse_without_first
-from services.research.reconstruct_capture import CaptureReconstruction, CaptureReconstructor, frames_of_capture
-from services.research.reconstruct_file import FileReconstruction, refuse_invalid, refuse_overwriting, write_picture
-from services.research.reconstruct_inputs import ReconstructOptions, Source
+from services.research.psf_stack import psf_stack
+from services.research.reconstruct_capture import (
+    CaptureFrames,
+    CaptureReconstruction,
+    CaptureReconstructor,
+    frames_of_capture,
+)
+from services.research.reconstruct_file import (
+    FileReconstruction,
+    refuse_output,
+    refuse_overwriting,
+    write_picture,
+)
+from services.research.reconstruct_inputs import ReconstructOptions, Source, name_of, stated_light
+
+
+@dataclass(frozen=True)
+class ChannelSource:
+    """Raw and PSF of one frame in one colour of light; files or arrays. `psf` None: that of a stored calibration."""
+
+    name: Colour
+    raw: Source
+    psf: Source | None = None
 
 
 def reconstruct_burst(raws: Sequence[Source], options: ReconstructOptions) -> FileReconstruction:
@@ -20,40 +46,124 @@ def reconstruct_burst(raws: Sequence[Source], options: ReconstructOptions) -> Fi
     for raws of different shapes or levels, with the same pixels, or that look like PSFs, and if the first cannot be
     used; SettingError for invalid options.
     """
-    solved = solve_burst(raws, replace(options, raw=raws[0]), Planner(options.plans)).made
+    _refuse_other_pictures(options, raws)
+    solved = _solved(CaptureReconstructor(options), frames_of_capture(raws, {})).made
     if options.output is not None:
         write_picture(options.output, solved.picture, solved.simulated)
     return solved
 
 
-def solve_burst(
-    raws: Sequence[Source],
-    options: ReconstructOptions,
-    planner: Planner,
-    colours: Mapping[Colour, Source] | None = None,
-) -> CaptureReconstruction:
-    """Return the picture of the raws of a burst, with one frame in each of `colours`, made as that of a press.
+def reconstruct_colours(
+    sources: Sequence[ChannelSource], options: ReconstructOptions, darks: Mapping[str, Source] | None = None
+) -> FileReconstruction:
+    """Reconstruct one picture (rows, cols, 3) in red, green and blue, and write it.
 
-    Errors as of `reconstruct_burst`.
+    A channel that is given more than once is a burst. The picture is on the grid of the first green frame, without
+    green of the first frame; it has the size of the raws and is 0 outside a known field. `options` holds all other
+    options (`raw` and `psfs` are ignored), `darks` the dark frames of single channels. The report is that of the
+    reference, with `channels`. SettingError for options that do not fit, FrameError as for a burst, and if no other
+    colour can be joined.
     """
-    _refuse_invalid(raws, options, 1 if colours else 2)
-    capture = CaptureReconstructor(options, planner)
-    loaded = capture.load(frames_of_capture(raws, colours or {}))
-    refuse_repeated(loaded.usable)
-    refuse_psfs(loaded.usable, loaded.psfs)
+    channels, darks = _by_name(sources), darks or {}
+    _refuse_invalid_channels(channels, options, darks)
+    reference: Colour = "green" if "green" in channels else next(iter(channels))
+    of_colours = {
+        name: replace(options, psfs=_psfs(given[0]), dark=darks.get(name, options.dark))
+        for name, given in channels.items()
+    }
+    raws = {name: [one.raw for one in given] for name, given in channels.items()}
+    lit = raws.pop(reference)
+    own = of_colours.pop(reference)
+    capture = CaptureReconstructor(own, of_colours=of_colours if options.calibration is None else None)
+    solved = _solved(capture, frames_of_capture(lit, raws, light=reference))
+    made = solved.made
+    if solved.colour is None:
+        reasons = "; ".join(f"{one.name}: {one.reason}" for one in made.report.channels if one.reason)
+        raise FrameError(f"no other colour can be joined to {reference}: {reasons}", "Look at these frames.")
+    picture = np.zeros((*made.picture.shape, 3), np.float32)
+    picture[solved.box] = solved.colour
+    if options.output is not None:
+        write_picture(options.output, picture, made.simulated)
+    return replace(made, picture=picture)
+
+
+def _solved(capture: CaptureReconstructor, frames: CaptureFrames) -> CaptureReconstruction:
+    """Return the picture of frames that a person gave; refuse those that are no frames of one capture."""
+    loaded = capture.load(frames)
+    for given in (loaded.usable, *loaded.others.values()):
+        refuse_repeated(given)
+        refuse_psfs(given, loaded.psfs)
     refuse_without_first(loaded.lit, loaded.unusable.get(0))
     solved = capture.solve(loaded)
     refuse_without_first(loaded.lit, solved.made.report.frames[0].reason)
     return solved
 
 
-def _refuse_invalid(raws: Sequence[Source], options: ReconstructOptions, least: int) -> None:
-    """Raise SettingError for options that a burst does not have, or an output that is a raw."""
-    if not least <= len(raws) <= MOST_FRAMES:
+def _refuse_other_pictures(options: ReconstructOptions, raws: Sequence[Source]) -> None:
+    """Raise SettingError for too many raws, options that only one raw has, or an output that is a raw."""
+    if len(raws) > MOST_FRAMES:
         raise SettingError(f"{len(raws)} raws are no burst", f"Give 2 to {MOST_FRAMES} raws of one eye in one light.")
-    refuse_invalid(options)
-    if options.sweep is not None:
-        raise SettingError("a sweep is drawn for one raw", "Leave --sweep out, or give one raw.")
-    if options.even:
-        raise SettingError("the picture of a burst is not evened out", "Leave --even out.")
+    if options.sweep is not None or options.even:
+        raise SettingError(
+            "the picture of several frames is not evened out, and has no sweep", "Leave --even and --sweep out."
+        )
     refuse_overwriting((options.output, options.report), raws)  # the options name only the first raw
+
+
+def _refuse_invalid_channels(
+    channels: Mapping[Colour, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
+) -> None:
+    """Raise SettingError for options that a colour picture does not have, or an output that is an input."""
+    given = [source for one in channels.values() for source in one]
+    if options.calibration is not None and (darks or any(one.psf is not None for one in given)):
+        raise SettingError(
+            "with a calibration a channel has no PSF and no dark frame of its own",
+            "Give --channel NAME RAW, and --dark FILE.",
+        )
+    if options.calibration is None and (options.psfs or options.bayer or any(one.psf is None for one in given)):
+        raise SettingError(
+            "each channel has a PSF of its own", "Give --channel NAME RAW PSF, without --psf and --bayer."
+        )
+    for name in darks:
+        if name not in channels:
+            raise SettingError(f"a dark frame is given for {name}, which is no channel", "Give the channel, too.")
+    if len(channels) < 2:
+        raise SettingError(
+            "a colour picture needs frames in two colours of light", "Give --channel again for another colour."
+        )
+    for one in given:
+        if (light := stated_light(one.raw)) not in (None, one.name):
+            raise SettingError(
+                f"{name_of(one.raw, 'the raw')} was taken in {light} light, and is given as {one.name}",
+                f"Give it as --channel {light}.",
+            )
+    if options.output is not None:
+        refuse_output(options.output)
+    inputs = [*(one.psf for one in given), *darks.values(), options.dark, options.flat, options.head]
+    refuse_overwriting((options.output, options.report), inputs)
+    _refuse_other_pictures(options, [one.raw for one in given])
+
+
+def _by_name(sources: Sequence[ChannelSource]) -> dict[Colour, list[ChannelSource]]:
+    """Return the sources of each channel, in the order in which they were given; SettingError for an unknown name."""
+    channels: dict[Colour, list[ChannelSource]] = {}
+    for one in sources:
+        if one.name not in CHANNELS:
+            raise SettingError(f"'{one.name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
+        channels.setdefault(one.name, []).append(one)
+    if not channels:
+        raise SettingError("a colour picture needs a channel", "Give --channel NAME RAW PSF.")
+    for name, given in channels.items():
+        if any(not _same(one.psf, given[0].psf) for one in given[1:]):
+            raise SettingError(f"{name} has several PSFs", "Give every raw of a colour with the PSF of that colour.")
+    return channels
+
+
+def _psfs(source: ChannelSource) -> tuple[Source, ...]:
+    return () if source.psf is None else psf_stack([source.psf])
+
+
+def _same(one: Source | None, other: Source | None) -> bool:
+    if one is None or other is None or isinstance(one, Path) or isinstance(other, Path):
+        return one is other or (isinstance(one, Path) and isinstance(other, Path) and one.resolve() == other.resolve())
+    return np.array_equal(one, other)

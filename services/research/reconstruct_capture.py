@@ -9,7 +9,6 @@ each calibration, frame shape and set of levels, so that many captures of one he
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -26,39 +25,37 @@ from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
 from device.recon.white_balance import light_dn_per_s
 from device.values import Calibration, Colour, FrameUse, Image, Psf, Reconstruction, Report
-from services.imaging.picture_files import read_raw_tiff
-from services.imaging.raw_metadata import RawMetadata
-from services.research.burst_frames import common_raw, rejections, unusable_raws, without_bad
+from services.research.burst_frames import common_raw, refuse_other_size, rejections, unusable_raws, without_bad
 from services.research.reconstruct_file import (
     FileReconstruction,
     FileReconstructor,
     doubts,
     file_report,
     plan_reconstructor,
-    refuse_invalid,
 )
 from services.research.reconstruct_inputs import (
-    LoadedPsfs,
     LoadedRaw,
     ReconstructOptions,
     Source,
     companion,
     companion_notes,
+    in_light,
     load_calibrations,
     load_psfs,
     load_raw,
+    stated_by,
+    stated_light,
     without_unknown,
 )
 
 KEPT_PLANS = 2  # each has the solvers of a burst and of the other colours
 NO_PSF = "the calibration has no PSF in this colour of light"
-NOT_GREEN = "colours are joined to a picture in green light, and this one is in {} light"
 Box = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
 class CaptureFrames:
-    """Raw frames of one capture: the burst `lit`, its reference first, and one frame in each other colour of light.
+    """Raw frames of one capture: the burst `lit`, its reference first, and the frames in each other colour of light.
 
     `dark`: dark frame of the burst and, where it fits them, of the other colours; `light`: colour of the burst, None if
     it is unknown; `unusable`: reason of each frame of the burst that must not enter the picture, by its index;
@@ -66,7 +63,7 @@ class CaptureFrames:
     """
 
     lit: tuple[Source, ...]
-    colours: Mapping[Colour, Source] = field(default_factory=dict)
+    colours: Mapping[Colour, Sequence[Source]] = field(default_factory=dict)
     dark: Source | None = None
     dark_fits_colours: bool = True
     light: Colour | None = None
@@ -76,36 +73,26 @@ class CaptureFrames:
 
 def frames_of_capture(
     lit: Sequence[Source],
-    colours: Mapping[Colour, Source],
+    colours: Mapping[Colour, Sequence[Source]],
     dark: Source | None = None,
     unusable: Mapping[int, str] | None = None,
+    light: Colour | None = None,
 ) -> CaptureFrames:
-    """Return the frames of a capture with the light and the exposures that its raw files state."""
-    stated = stated_by(lit[0])
-    light = None if stated is None or stated.illumination is None else stated.illumination.colour
+    """Return the frames of a capture with the light (unless given) and the exposures that its raw files state."""
+    others = [one for frames in colours.values() for one in frames]
     full_drive_s = {
         one.illumination.colour: one.exposure_s * one.illumination.level
-        for one in map(stated_by, (lit[0], *colours.values()))
+        for one in map(stated_by, (*reversed(others), lit[0]))
         if one is not None and one.illumination is not None and one.exposure_s is not None
     }
-    fits = _dark_fits(lit[0] if dark is None else dark, colours.values())
-    return CaptureFrames(tuple(lit), colours, dark, fits, light, unusable or {}, full_drive_s)
+    fits = _dark_fits(lit[0] if dark is None else dark, others)
+    return CaptureFrames(tuple(lit), colours, dark, fits, light or stated_light(lit[0]), unusable or {}, full_drive_s)
 
 
 def _dark_fits(dark: Source, others: Iterable[Source]) -> bool:
     """Return True if the dark frame fits the frames in other colours of light, as far as they state an exposure."""
     dark_s, *others_s = (None if one is None else one.exposure_s for one in map(stated_by, (dark, *others)))
     return dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
-
-
-def stated_by(raw: Source) -> RawMetadata | None:
-    """Return what a raw frame of the instrument states about itself; None for another file, or an array."""
-    if not isinstance(raw, Path) or raw.suffix.lower() not in (".tif", ".tiff"):
-        return None
-    try:
-        return read_raw_tiff(raw.read_bytes())[1]
-    except (FrameError, OSError):
-        return None
 
 
 @dataclass(frozen=True)
@@ -129,16 +116,21 @@ class LoadedCapture:
 
     frames: CaptureFrames
     lit: tuple[LoadedRaw, ...]
-    others: Mapping[Colour, LoadedRaw]
+    others: Mapping[Colour, tuple[LoadedRaw, ...]]
     unusable: Mapping[int, str]
     common: LoadedRaw
-    plan: "_Plan"
+    plan: "_CaptureSolvers"
     notes: tuple[str, ...]
 
     @property
     def usable(self) -> tuple[LoadedRaw, ...]:
         """Frames of the burst that may enter the picture."""
         return tuple(one for k, one in enumerate(self.lit) if k not in self.unusable)
+
+    @property
+    def whole(self) -> tuple[LoadedRaw, ...]:
+        """All frames: those of the burst, and those of the other colours."""
+        return (*self.lit, *(one for frames in self.others.values() for one in frames))
 
     @property
     def psfs(self) -> tuple[Psf, ...]:
@@ -149,26 +141,25 @@ class LoadedCapture:
 class CaptureReconstructor:
     """Reconstruction of the captures of one calibration; the options but `raw` hold for all of them. Not thread-safe.
 
-    `colour_psfs` are the PSFs of the other colours, where the options have files of PSFs and no archived calibration.
-    SettingError for invalid options.
+    `of_colours` are the options of the other colours, with PSFs and dark frame of their own, where `options` has files
+    of PSFs and no archived calibration. SettingError for invalid options.
     """
 
     def __init__(
         self,
         options: ReconstructOptions,
         planner: Planner | None = None,
-        colour_psfs: Mapping[Colour, tuple[Path, ...]] | None = None,
+        of_colours: Mapping[Colour, ReconstructOptions] | None = None,
     ) -> None:
-        refuse_invalid(options)
         self._options, self._planner = options, planner or Planner(options.plans)
-        self._colour_psfs = colour_psfs or {}
-        self._singles: dict[Colour | None, FileReconstructor] = {}
-        self._plans: OrderedDict[tuple[object, ...], _Plan] = OrderedDict()
+        self._single, self._of_colours = FileReconstructor(options, self._planner), of_colours or {}
+        self._plans: OrderedDict[tuple[object, ...], _CaptureSolvers] = OrderedDict()
 
     def __call__(self, frames: CaptureFrames) -> CaptureReconstruction:
         """Return the picture of a capture; FrameError or PsfError for frames that cannot be solved."""
         if len(frames.lit) == 1 and not frames.colours:
-            return self._single(frames)
+            made = self._single(frames.lit[0], frames.dark)
+            return CaptureReconstruction(made, self._single.box)
         return self.solve(self.load(frames))
 
     def load(self, frames: CaptureFrames) -> LoadedCapture:
@@ -178,9 +169,9 @@ class CaptureReconstructor:
         if len(unusable) == len(lit):
             raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take it again.")
         common = common_raw([one for k, one in enumerate(lit) if k not in unusable])
-        others = {name: load_raw(source) for name, source in frames.colours.items()}
+        others = {name: tuple(load_raw(one) for one in sources) for name, sources in frames.colours.items()}
         _refuse_different(common, others)
-        plan, notes = self._plan(common, frames)
+        plan, notes = self._plan(common, {name: common_raw(given) for name, given in others.items()}, frames)
         return LoadedCapture(frames, lit, others, unusable, common, plan, notes)
 
     def solve(self, loaded: LoadedCapture) -> CaptureReconstruction:
@@ -188,128 +179,154 @@ class CaptureReconstructor:
         frames, common = loaded.frames, loaded.common
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
         lit = [without_unknown(without_bad(one.raw), dark)[0] for one in loaded.lit]
-        others = {name: without_unknown(without_bad(one.raw), dark)[0] for name, one in loaded.others.items()}
+        others = {
+            name: [without_unknown(without_bad(one.raw), dark)[0] for one in given]
+            for name, given in loaded.others.items()
+        }
         dark = None if dark is None else np.nan_to_num(dark)
         made = loaded.plan.solve(
             lit, loaded.unusable, dark, others, dark if frames.dark_fits_colours else None, frames.full_drive_s
         )
-        return self._reported(made, loaded.plan, [*loaded.lit, *loaded.others.values()], loaded.notes)
+        return self._reported(made, loaded)
 
-    def _single(self, frames: CaptureFrames) -> CaptureReconstruction:
-        """Return the picture of one frame, with the solver of one frame."""
-        if frames.light not in self._singles:
-            options = replace(self._options, light=frames.light)
-            self._singles[frames.light] = FileReconstructor(options, self._planner)
-        solver = self._singles[frames.light]
-        made = solver(frames.lit[0], frames.dark)
-        return CaptureReconstruction(made, solver.box)
+    def _plan(
+        self, common: LoadedRaw, others: Mapping[Colour, LoadedRaw], frames: CaptureFrames
+    ) -> tuple["_CaptureSolvers", tuple[str, ...]]:
+        """Return the solvers for the levels of a capture, and notes about the files of the PSFs.
 
-    def _plan(self, common: LoadedRaw, frames: CaptureFrames) -> tuple["_Plan", tuple[str, ...]]:
-        """Return the solvers for the levels of a capture, and notes about the files of the PSFs."""
-        psfs = self._psfs(self._options, common)
-        raw, light = common.raw, frames.light
-        whole = self._calibration(self._options, common, psfs)
-        green = whole if light is None else whole.for_colour(light)
-        index = most_likely_psf(green, raw.pixels, self._planner)[0] if len(green.psfs) > 1 else 0
-        levels = (raw.white_dn, raw.shift, raw.stored_bits, common.black_dn, common.simulated)
-        key = (common.solved_shape, *levels, light, index, tuple(sorted(frames.colours)))
+        `common` and `others` have the levels of all frames of a colour.
+        """
+        whole, notes = self._calibration(self._options, common)
+        reference = in_light(whole, frames.light, common.name)
+        index = most_likely_psf(reference, common.raw.pixels, self._planner)[0] if len(reference.psfs) > 1 else 0
+        counts = tuple((name, len(given) > 1, _levels(others[name])) for name, given in sorted(frames.colours.items()))
+        key = common.solved_shape, _levels(common), len(frames.lit) > 1, frames.light, index, counts
         if key not in self._plans:
-            others = {name: self._of_colour(name, common, whole, green, light) for name in frames.colours}
-            self._plans[key] = _Plan(self._options, green, others, common.solved_shape, self._planner, index)
+            calibrations = {name: self._of_colour(name, one, whole, reference) for name, one in others.items()}
+            self._plans[key] = _CaptureSolvers(self._options, reference, calibrations, frames, self._planner, index)
             while len(self._plans) > KEPT_PLANS:
                 self._plans.popitem(last=False)
         self._plans.move_to_end(key)
-        return self._plans[key], () if psfs is None else psfs.notes
+        return self._plans[key], notes
 
     def _of_colour(
-        self, name: Colour, common: LoadedRaw, whole: Calibration, green: Calibration, light: Colour | None
+        self, name: Colour, loaded: LoadedRaw, whole: Calibration, reference: Calibration
     ) -> Calibration | str:
-        """Return the calibration of another colour, `green` itself if its PSF holds for any colour, or why none fits.
+        """Return the calibration of another colour, `reference` if its PSF holds for any colour, or why none fits.
 
         It is that of the instrument: PSFs of that colour, else those that hold for any colour.
         """
-        if light not in (None, "green"):
-            return NOT_GREEN.format(light)
-        if name in self._colour_psfs:
-            options = replace(self._options, psfs=self._colour_psfs[name])
-            return self._calibration(options, common, self._psfs(options, common))
+        if name in self._of_colours:
+            return self._calibration(self._of_colours[name], loaded)[0]
         measured = {psf.colour for psf in whole.psfs}
         if name in measured:
             return whole.for_colour(name)
-        return green if None in measured else NO_PSF
+        return reference if None in measured else NO_PSF
 
-    def _psfs(self, options: ReconstructOptions, common: LoadedRaw) -> LoadedPsfs | None:
-        return None if options.calibration is not None else load_psfs(options, common, per_channel=False)
+    def _calibration(self, options: ReconstructOptions, common: LoadedRaw) -> tuple[Calibration, tuple[str, ...]]:
+        """Return the calibration of the options for a raw, and notes about the files of the PSFs."""
+        psfs = None if options.calibration is not None else load_psfs(options, common, per_channel=False)
+        (calibration,) = load_calibrations(options, common, psfs)
+        return calibration, () if psfs is None else psfs.notes
 
-    def _calibration(self, options: ReconstructOptions, common: LoadedRaw, psfs: LoadedPsfs | None) -> Calibration:
-        return load_calibrations(options, common, psfs)[0]
-
-    def _reported(
-        self, made: Reconstruction, plan: "_Plan", loaded: Sequence[LoadedRaw], notes: tuple[str, ...]
-    ) -> CaptureReconstruction:
+    def _reported(self, made: Reconstruction, loaded: LoadedCapture) -> CaptureReconstruction:
         """Return the result with the report of a file; FrameError for a picture without signal."""
+        plan, frames = loaded.plan, made.report.frames
         if NO_SIGNAL in made.report.warnings:
-            raise FrameError(f"{loaded[0].name} holds no signal above the black level", "Give frames taken with light.")
-        count = len(made.report.frames)
-        of_raws = [note for one in loaded for note in one.notes]
-        of_companions = companion_notes(self._options, plan.single.calibration)
-        texts = (
+            raise FrameError(
+                f"{loaded.lit[0].name} holds no signal above the black level", "Give frames taken with light."
+            )
+        of_raws = [note for one in loaded.whole for note in one.notes]
+        texts = [
             *doubts(made.report, plan.single, of_raws),
-            *rejections(loaded[:count], made.report.frames),
-            *notes,
-            *of_companions,
+            *rejections(loaded.lit, frames),
+            *(_of_colours(made, loaded) if isinstance(made, ColourReconstruction) else ()),
+            *loaded.notes,
+            *companion_notes(self._options, plan.single.calibration),
             *of_raws,
-        )
+        ]
         report = file_report(made.report, plan.single, self._options)
         report = replace(report, warnings=tuple(dict.fromkeys((*report.warnings, *texts))))
-        simulated = made.simulated or plan.single.calibration.simulated or any(one.simulated for one in loaded)
+        simulated = made.simulated or plan.single.calibration.simulated or any(one.simulated for one in loaded.whole)
         colour = made.colour if isinstance(made, ColourReconstruction) else None
         box = field_box(plan.single.calibration, plan.single.shape)
         return CaptureReconstruction(FileReconstruction(made.picture, report, simulated), box, colour)
 
 
-def _refuse_different(common: LoadedRaw, others: Mapping[Colour, LoadedRaw]) -> None:
-    """Raise FrameError for a frame in another colour that has another size, number of channels or kind of levels."""
-    for name, one in others.items():
-        if (one.shape, one.channels, one.raw.shift) != (common.shape, common.channels, common.raw.shift):
-            raise FrameError(
-                f"{one.name}, in {name} light, has another size or other levels than {common.name}",
-                "Give the frames of one capture, in one and the same camera mode.",
-            )
+def _levels(loaded: LoadedRaw) -> tuple[object, ...]:
+    raw = loaded.raw
+    return raw.white_dn, raw.shift, raw.stored_bits, loaded.black_dn, loaded.simulated
 
 
-class _Plan:
-    """Solvers of captures of one set of levels: of one frame, of the burst, and of the other colours."""
+def _of_colours(made: ColourReconstruction, loaded: LoadedCapture) -> list[str]:
+    """Return what the other colours have to say: their warnings, frames that were left out, what is predicted."""
+    notes = []
+    for name, report in made.others.items():
+        single = loaded.plan.singles[name]
+        words = *report.warnings, *doubts(report, single, [note for one in loaded.others[name] for note in one.notes])
+        notes += [f"{name}: {one}" for one in words]
+        notes += rejections(loaded.others[name], report.frames)
+    predicted = [one.name for one in made.report.channels if one.predicted]
+    return [*notes, *(f"{name} is predicted from the other colours, not measured." for name in predicted)]
+
+
+def _refuse_different(common: LoadedRaw, others: Mapping[Colour, Sequence[LoadedRaw]]) -> None:
+    """Raise FrameError for a frame in another colour that has another size or kind of levels, or colours."""
+    for name, frames in others.items():
+        for one in frames:
+            refuse_other_size(one, common)
+            if one.raw.shift != common.raw.shift:
+                raise FrameError(
+                    f"{one.name}, in {name} light, has other levels than {common.name}",
+                    "Give the frames of one capture, in one and the same camera mode.",
+                )
+
+
+class _CaptureSolvers:
+    """Solvers of captures of one set of levels: of the first colour and of the others, each of one frame or a burst."""
 
     def __init__(
         self,
         options: ReconstructOptions,
-        green: Calibration,
+        reference: Calibration,
         others: Mapping[Colour, Calibration | str],
-        shape: tuple[int, int],
+        frames: CaptureFrames,
         planner: Planner,
         index: int,
     ) -> None:
-        self._budget_s, self._clock = options.budget_s, SystemClock()
-        self.single = plan_reconstructor(options, green, shape, planner, index, quick=True)
-        self._bursts = BurstReconstructor(self.single, planner, timed=self._budget_s is not None)
-        like_green = replace(options, bin=self.single.stages[-1].recipe.bin)
+        self._budget_s, self._clock, self._light = options.budget_s, SystemClock(), frames.light or "green"
+        self._timed, self._planner, shape = self._budget_s is not None, planner, reference.psfs[0].pixels.shape
+        self.single = plan_reconstructor(options, reference, shape, planner, index, quick=len(frames.lit) > 1)
+        self._lit = self._of_frames(self.single, len(frames.lit))
+        like_first = replace(options, bin=self.single.stages[-1].recipe.bin)
         self._missing = {name: why for name, why in others.items() if isinstance(why, str)}
-        solvers: dict[Colour, Reconstructor] = {}
+        solvers: dict[Colour, Reconstructor | BurstReconstructor] = {}
         for name, own in others.items():
-            if own is green:
-                solvers[name] = self.single
+            count = len(frames.colours[name])
+            if own is reference:
+                solvers[name] = self._of_frames(self.single, count)
             elif isinstance(own, Calibration):
                 nearest = min(index, len(own.psfs) - 1)
-                solvers[name] = plan_reconstructor(like_green, own, shape, planner, nearest, quick=True, main=False)
-        self._colours = ColourReconstructor(self.single, solvers) if others else None
+                single = plan_reconstructor(like_first, own, shape, planner, nearest, quick=count > 1, refract=False)
+                solvers[name] = self._of_frames(single, count)
+        self._colours = None
+        if others:
+            self._colours = ColourReconstructor(self.single, solvers, reference=self._light, timed=self._timed)
+
+    def _of_frames(self, single: Reconstructor, count: int) -> Reconstructor | BurstReconstructor:
+        return single if count == 1 else BurstReconstructor(single, self._planner, timed=self._timed)
+
+    @property
+    def singles(self) -> Mapping[Colour, Reconstructor]:
+        """Solvers of one frame in each other colour."""
+        return {} if self._colours is None else self._colours.singles
 
     def solve(
         self,
         lit: Sequence[Pixels],
         unusable: Mapping[int, str],
         dark: Image | None,
-        others: Mapping[Colour, Pixels],
+        others: Mapping[Colour, Sequence[Pixels]],
         others_dark: Image | None,
         full_drive_s: Mapping[Colour, float],
     ) -> Reconstruction:
@@ -317,10 +334,14 @@ class _Plan:
         deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
         order = sorted(range(len(lit)), key=lambda k: k in unusable)  # the first one must be usable
         reasons = {place: unusable[k] for place, k in enumerate(order) if k in unusable}
-        steps = self._bursts.steps([lit[k] for k in order], dark, simulated=False, deadline=deadline, unusable=reasons)
+        if isinstance(self._lit, BurstReconstructor):
+            ordered = [lit[k] for k in order]
+            steps = self._lit.steps(ordered, dark, simulated=False, deadline=deadline, unusable=reasons)
+        else:
+            steps = self._lit.steps(lit[0], dark, simulated=False, deadline=deadline)
         if self._colours is not None:
             solved = {name: counts for name, counts in others.items() if name not in self._missing}
-            lights = self._lights_dn_per_s({**solved, "green": lit[order[0]]}, dark, others_dark, full_drive_s)
+            first = {self._light: lit[order[0]], **{name: given[0] for name, given in solved.items()}}
             steps = self._colours.steps(
                 steps,
                 solved,
@@ -328,7 +349,7 @@ class _Plan:
                 simulated=False,
                 deadline=deadline,
                 missing=self._missing,
-                lights_dn_per_s=lights,
+                lights_dn_per_s=self._lights_dn_per_s(first, dark, others_dark, full_drive_s),
             )
         (made,) = deque(steps, maxlen=1)
         assert isinstance(made, Reconstruction)
@@ -344,7 +365,7 @@ class _Plan:
         """Return the light of each colour at full drive; none without a white reference to compare with."""
         calibration = self.single.calibration
         return {
-            name: light_dn_per_s(counts, dark if name == "green" else others_dark, calibration, full_drive_s[name])
+            name: light_dn_per_s(counts, dark if name == self._light else others_dark, calibration, full_drive_s[name])
             for name, counts in frames.items()
             if calibration.white is not None and name in full_drive_s
         }

@@ -47,6 +47,7 @@ from services.research.reconstruct_inputs import (
     load_calibrations,
     load_psfs,
     load_raw,
+    stated_light,
     swap_notes,
     without_unknown,
 )
@@ -125,15 +126,16 @@ class FileReconstructor:
         refuse_invalid(options)
         self._options, self._planner = options, planner or Planner(options.plans)
         self._psfs: dict[tuple[Shape, int, str | None], LoadedPsfs | None] = {}
-        self._plans: OrderedDict[tuple[object, ...], _Plan] = OrderedDict()
-        self._last: _Plan | None = None
+        self._plans: OrderedDict[tuple[object, ...], _FrameSolvers] = OrderedDict()
+        self._last: _FrameSolvers | None = None
 
     def __call__(self, source: RawSource, dark: Source | None = None) -> FileReconstruction:
         """Return the picture of a raw, a file or an array; FrameError or PsfError for one that cannot be solved.
 
         `dark`: the dark frame of this raw alone, (rows, cols) of it.
         """
-        loaded = load_raw(source, self._options.bayer)
+        light = None if self._options.calibration is None else stated_light(source)
+        loaded = replace(load_raw(source, self._options.bayer), light=light)
         psfs = self._psfs_for(loaded)
         plan = self._last = self._plan(loaded, psfs)
         own = None if dark is None else companion(dark, "the dark frame", loaded)
@@ -184,23 +186,23 @@ class FileReconstructor:
             self._psfs[key] = None if archived else load_psfs(self._options, loaded)
         return self._psfs[key]
 
-    def _plan(self, loaded: LoadedRaw, psfs: LoadedPsfs | None) -> "_Plan":
+    def _plan(self, loaded: LoadedRaw, psfs: LoadedPsfs | None) -> "_FrameSolvers":
         """Return the plan for the shape and levels of a raw, and make it the last one to be dropped."""
         raw = loaded.raw
         bad = raw.bad.tobytes() if raw.bad.any() else b""
-        levels = (raw.white_dn, raw.shift, raw.stored_bits, loaded.black_dn, loaded.simulated, bad)
+        levels = (raw.white_dn, raw.shift, raw.stored_bits, loaded.black_dn, loaded.simulated, loaded.light, bad)
         key = (loaded.shape, loaded.channels, loaded.bayer, *levels)
         if key not in self._plans:
             calibrations = load_calibrations(self._options, loaded, psfs)
             is_mosaic = loaded.bayer is not None
-            self._plans[key] = _Plan(self._options, calibrations, loaded.solved_shape, self._planner, is_mosaic)
+            self._plans[key] = _FrameSolvers(self._options, calibrations, loaded.solved_shape, self._planner, is_mosaic)
             while len(self._plans) > KEPT_PLANS:
                 self._plans.popitem(last=False)
         self._plans.move_to_end(key)
         return self._plans[key]
 
 
-class _Plan:
+class _FrameSolvers:
     """Solvers for one shape and one set of levels: one for all channels, or one for each; planned for each used PSF."""
 
     def __init__(
@@ -350,14 +352,13 @@ def plan_reconstructor(
     index: int,
     *,
     quick: bool = False,
-    main: bool = True,
+    refract: bool = True,
 ) -> Reconstructor:
     """Return the reconstructor of the options, planned for a calibration and a frame shape; `index` is the PSF's.
 
-    `quick`: with a quick look before the picture, as with a time budget. `main`: its report is shown, so it estimates
-    the refraction and tests the PSF.
+    `quick`: with a quick look before the picture, as with a time budget. `refract`: with the refraction of the eye, if
+    the options have it.
     """
-    consistency = PsfConsistency(calibration, shape, index) if main else None
     method = None if options.method is None else find_method(options.method)
     recipes = _recipes(options, method, calibration, shape, index)
     if quick and len(recipes) == 1:
@@ -369,8 +370,8 @@ def plan_reconstructor(
         SystemClock(),
         recipes,
         index,
-        refract=main and options.refraction,
-        consistency=consistency,
+        refract=refract and options.refraction,
+        consistency=PsfConsistency(calibration, shape, index),
         timed=options.budget_s is not None,
         methods=METHODS if method is None else {**METHODS, method.name: method},
         audience=Audience.FILES,

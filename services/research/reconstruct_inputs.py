@@ -36,6 +36,8 @@ from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import MOST_BAD
 from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
+from services.imaging.picture_files import read_raw_tiff
+from services.imaging.raw_metadata import RawMetadata
 
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
 RawSource = Source | Raw  # or counts that are read
@@ -52,8 +54,7 @@ class ReconstructOptions:
     correction of the picture. `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and
     `settings` (of the method, see device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`:
     the raw is a mosaic of this pattern, or "none". `field_fixed`: the field is known exactly, and the refraction does
-    not estimate its edge. `refraction` False leaves the refraction out. `light`: colour of the raw, for which the PSFs
-    of an archived calibration are chosen (None: all are used).
+    not estimate its edge. `refraction` False leaves the refraction out.
     """
 
     raw: Source
@@ -76,7 +77,6 @@ class ReconstructOptions:
     bayer: BayerOption | None = None
     field_fixed: bool = False
     refraction: bool = True
-    light: Colour | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ class LoadedRaw:
     """A raw frame as it is solved: of a mosaic, the colour planes of half the rows and columns.
 
     `shape` is (rows, cols) of the file, `bayer` the pattern of a mosaic, `black_dn` the black level that the file
-    states. `notes` are sentences for the user.
+    states, `light` the colour for which the PSFs of an archived calibration are chosen (None: all are used). `notes`
+    are sentences for the user.
     """
 
     raw: Raw
@@ -94,6 +95,7 @@ class LoadedRaw:
     black_dn: float | None = None
     simulated: bool = False
     notes: tuple[str, ...] = ()
+    light: Colour | None = None
 
     @property
     def solved_shape(self) -> Shape:
@@ -125,6 +127,22 @@ def is_simulated(source: RawSource) -> bool:
     if isinstance(source, Path):
         return is_marked_simulated(source)
     return isinstance(source.pixels if isinstance(source, Raw) else source, SimulatedCounts)
+
+
+def stated_by(raw: RawSource) -> RawMetadata | None:
+    """Return what a raw frame of the instrument states about itself; None for another file, or an array."""
+    if not isinstance(raw, Path) or raw.suffix.lower() not in (".tif", ".tiff"):
+        return None
+    try:
+        return read_raw_tiff(raw.read_bytes())[1]
+    except (FrameError, OSError):
+        return None
+
+
+def stated_light(raw: RawSource) -> Colour | None:
+    """Return the colour of light in which a raw frame states to have been taken; None if it states none."""
+    stated = stated_by(raw)
+    return None if stated is None or stated.illumination is None else stated.illumination.colour
 
 
 def load_raw(source: RawSource, pattern: BayerOption | None = None, checked: bool = True) -> LoadedRaw:
@@ -407,8 +425,7 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     archive = Archive(Path(folder if colon else place))
     kept = archive.load(id if colon else None)
     found, raw = kept.calibration, loaded.raw
-    if options.light is not None:
-        found = found.for_colour(options.light)
+    found = in_light(found, loaded.light, loaded.name)
     require_same_shape(found.psfs, loaded.solved_shape)
     known = "white_dn" not in kept.provenance.unknown
     white_dn = min(found.sensor.white_dn, raw.white_dn) if known else raw.white_dn
@@ -422,6 +439,18 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
         bad=raw.bad if found.bad is None else found.bad | raw.bad,
         simulated=found.simulated or loaded.simulated,
     )
+
+
+def in_light(calibration: Calibration, light: Colour | None, name: str) -> Calibration:
+    """Return the calibration with the PSFs for a raw in this light, all of them for None; SettingError without any."""
+    if light is None:
+        return calibration
+    if {light, None}.isdisjoint(psf.colour for psf in calibration.psfs):
+        raise SettingError(
+            f"{name} was taken in {light} light, and the calibration has no PSF for it",
+            "Choose a calibration with a PSF in this light, or give its PSF: --psf FILE.",
+        )
+    return calibration.for_colour(light)
 
 
 def companion(source: Source, what: str, loaded: LoadedRaw, above_black: bool = False) -> Image:

@@ -20,7 +20,7 @@ FILE = Path(__file__).parent / "site" / "report.schema.json"
 SECONDS: Mapping[str, str] = {
     "expose": "Lit and dark exposure; captures only.",
     "join": "Picture of each raw of a burst, their registration, and the joined frame; bursts only.",
-    "colour": "Pictures in the other colours of light, their registration, and the colour picture; captures only.",
+    "colour": "Pictures in the other colours of light, their registration, and the colour picture.",
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
     "cylinder": "Wait for the estimate of the cylinder: before the picture if it has no time budget, or after it.",

@@ -228,9 +228,9 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
         "reconstruct_burst",
     ),
     (
-        "services/research/reconstruct_colour.py",
-        "any(one.simulated for one in made.values())",
-        "False",
+        "services/research/reconstruct_burst.py",
+        "picture, made.simulated)",
+        "picture, False)",
         "reconstruct_channels",
     ),
     (

@@ -441,7 +441,6 @@ def test_live_picture_of_a_calibration(head: Path, simulated: bool) -> None:
 # ---- The list
 
 CAPTURE, EACH = "test_files_of_a_capture", "test_reconstruct_each"
-OF_PRESS = "tests/hard/test_press_and_command.py::test_a_colour_press_is_repeated_with_its_calibration"
 IN_REPORT = "tests/archive/test_archive_report.py::test_pictures_are_marked_where_their_frames_are_simulated"
 WRITERS = {
     "device/calibration/procedure/raw_recorder.py record": "test_raw_frames_of_a_calibration",
@@ -469,8 +468,7 @@ WRITERS = {
     "services/research/montage_files.py montage_files": "test_montage",
     "tests/paper/pictures.py _png": "test_pictures_of_the_paper",
     "services/research/reconstruct_burst.py reconstruct_burst": "test_reconstruct_burst",
-    "services/research/reconstruct_colour.py _joined": "test_reconstruct_channels",
-    "services/research/reconstruct_colour.py _press": OF_PRESS,
+    "services/research/reconstruct_burst.py reconstruct_colours": "test_reconstruct_channels",
     "services/research/reconstruct_each.py _reconstruct_one": EACH,
     "services/research/reconstruct_file.py reconstruct_file": "test_reconstruct",
     "services/research/reconstruct_file.py save": "test_python",

@@ -32,7 +32,9 @@ class Bench:
         self, red: np.ndarray | None = None, deadline: Deadline | None = None, missing: dict[Colour, str] | None = None
     ) -> list[Step]:
         green = self.green.steps(self.frames["green"], simulated=True, deadline=deadline)
-        frames: dict[Colour, np.ndarray] = {} if missing else {"red": self.frames["red"] if red is None else red}
+        frames: dict[Colour, list[np.ndarray]] = (
+            {} if missing else {"red": [self.frames["red"] if red is None else red]}
+        )
         return list(self.colours.steps(green, frames, simulated=True, deadline=deadline, missing=missing))
 
     def picture(self, **given: object) -> Reconstruction:
@@ -111,7 +113,7 @@ def test_red_is_solved_with_its_psf_stretched_as_that_of_green(bench: Bench) -> 
 def test_a_quick_look_in_red_between_two_steps_does_not_change_the_picture(bench: Bench) -> None:
     alone = bench.picture()
     green = bench.green.steps(bench.frames["green"], simulated=True)
-    for step in bench.colours.steps(green, {"red": bench.frames["red"]}, simulated=True):
+    for step in bench.colours.steps(green, {"red": [bench.frames["red"]]}, simulated=True):
         if isinstance(step, RoundDone):
             bench.red(frame(seen(RETINA, (9, 9)), 2000, 8), quick=True)
     assert isinstance(step, ColourReconstruction)
@@ -122,7 +124,7 @@ def test_a_quick_look_in_red_between_two_steps_does_not_change_the_picture(bench
 def test_a_psf_of_any_colour_needs_no_reconstructor_of_its_own(bench: Bench) -> None:
     shared = ColourReconstructor(bench.green, {"red": bench.green})
     green = bench.green.steps(bench.frames["green"], simulated=True)
-    *_, made = shared.steps(green, {"red": bench.frames["red"]}, simulated=True)
+    *_, made = shared.steps(green, {"red": [bench.frames["red"]]}, simulated=True)
     own = bench.picture()
     assert isinstance(made, ColourReconstruction)
     assert isinstance(own, ColourReconstruction)

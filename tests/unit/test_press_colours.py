@@ -53,7 +53,7 @@ def test_a_press_of_a_ring_with_amber_gives_a_picture_in_colour(tmp_path: Path) 
         pipeline = plan_pipeline(head, clock, tmp_path)
         assert pipeline.colours is not None
         green_steps = pipeline.reconstructor.steps(press.lit[0].counts, simulated=True)
-        others = {colour: one.counts for colour, one in press.colours.items()}
+        others = {colour: [one.counts] for colour, one in press.colours.items()}
         *_, made = pipeline.colours.steps(green_steps, others, simulated=True, missing=press.missing)
     finally:
         head.close()

@@ -81,7 +81,7 @@ def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tm
         }
         green = pipeline.reconstructor.steps(press.lit[0].counts, simulated=True)
         assert pipeline.colours is not None
-        red = {"red": press.colours["red"].counts}
+        red = {"red": [press.colours["red"].counts]}
         *_, made = pipeline.colours.steps(green, red, simulated=True, lights_dn_per_s=lights)
     finally:
         head.close()
