@@ -112,7 +112,7 @@ test-browser: .venv/ready browser ## Try the page in every state, size and langu
 	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR tests/browser $(addprefix --ignore=,$(JOURNEYS))
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
-	@$(BIN)/python -m pytest -n auto -m paper tests/physics
+	@$(BIN)/python -m pytest -n auto -m paper --timeout 900 tests/physics
 
 test-hard: .venv/ready ## Run the whole grid of hard cases and write it to out/hard; it fails on a violation.
 	@$(BIN)/diffuscope hard -o out/hard --check

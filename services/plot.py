@@ -1,7 +1,7 @@
-"""Small SVG plots of series over two linear or logarithmic axes; the marks of each series have their shape and colour.
+"""SVG documents: plots of series over two linear or logarithmic axes, and the elements of other drawings.
 
-The SVG has no external fonts, scripts or files, and suits light and dark backgrounds. A mark can have a tooltip with
-its numbers, which screen readers read as well.
+An SVG has no external fonts, scripts or files, suits light and dark backgrounds, and has a title and a description for
+screen readers. The marks of each series have their shape and colour; a mark can have a tooltip with its numbers.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -159,15 +159,24 @@ def stacked_svg(plots: Sequence[Plot], between: Sequence[Panel] = ()) -> str:
         elements = _elements(one) if isinstance(one, Plot) else one.elements
         panels += [f'<g transform="translate(0 {down})">', *elements, "</g>"]
         down += one.height
+    return document(wide, tall, plots[0].title, " ".join(one.description for one in every), panels)
+
+
+def document(
+    width_px: float, height_px: float, title: str, description: str, elements: Iterable[str], style: str = ""
+) -> str:
+    """Return a complete SVG document of `elements` on a plain ground.
+
+    `title` and `description` are read by screen readers and not drawn; `style` is CSS beside that of plots.
+    """
     return "\n".join(
         [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
-            'role="img" aria-labelledby="plot-title plot-desc">',
-            f'<title id="plot-title">{escape(plots[0].title)}</title>',
-            f'<desc id="plot-desc">{escape(" ".join(one.description for one in every))}</desc>',
-            f"<style>{STYLE}</style>",
-            f'<rect class="ground" width="{wide}" height="{tall}"/>',
-            *panels,
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width_px:g} {height_px:g}" width="{width_px:g}" '
+            f'height="{height_px:g}" role="img" aria-labelledby="plot-title plot-desc">',
+            f'<title id="plot-title">{escape(title)}</title><desc id="plot-desc">{escape(description)}</desc>',
+            f"<style>{STYLE}{style}</style>",
+            f'<rect class="ground" width="{width_px:g}" height="{height_px:g}"/>',
+            *elements,
             "</svg>\n",
         ]
     )
@@ -197,6 +206,17 @@ def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
 
 
+def polyline(places: Iterable[tuple[float, float]], kind: str) -> str:
+    """Return an SVG polyline through `places`, pairs (x, y) in px; `kind` is its CSS class."""
+    return f'<polyline class="{kind}" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>'
+
+
+def rectangle(x: float, y: float, width_px: float, height_px: float, kind: str = "", style: str = "") -> str:
+    """Return an SVG rectangle with the corner (x, y) in px; `kind` is its CSS class, `style` its own CSS."""
+    own = f' style="{style}"' if style else ""
+    return f'<rect class="{kind}"{own} x="{x:g}" y="{y:g}" width="{width_px:g}" height="{height_px:g}"/>'
+
+
 def _upright(x: float, y: float, words: str) -> str:
     return f'<text transform="translate({x:.1f} {y:.1f}) rotate(-90)" text-anchor="middle">{escape(words)}</text>'
 
@@ -215,7 +235,7 @@ def _frame(plot: Plot) -> list[str]:
         if TOP <= at <= low:
             out += [line(high, at, high + 5, at, "frame"), text(high + 8, at + 4, words, "small")]
     middle = (TOP + low) / 2
-    out.append(f'<rect class="frame" x="{LEFT}" y="{TOP}" width="{high - LEFT}" height="{low - TOP}"/>')
+    out.append(rectangle(LEFT, TOP, high - LEFT, low - TOP, "frame"))
     out.append(text((LEFT + high) / 2, plot.height - 16, plot.x.title, "", "middle"))
     out.append(_upright(24, middle, plot.y.title))
     if plot.right_title:
@@ -256,7 +276,7 @@ def _series(plot: Plot) -> list[str]:
             places = [(_x(plot, mark.x), _y(plot, mark.y)) for mark in trail]
             if len(places) > 1:
                 kind = "trail" if any(mark.weight for mark in trail) else "trail line"
-                out.append(f'<polyline class="{kind}" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+                out.append(polyline(places, kind))
             for mark, (x, y) in zip(trail, places, strict=True):
                 if not mark.weight:
                     continue

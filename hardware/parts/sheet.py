@@ -1,10 +1,9 @@
 """The sheet of one picture: from mm to pixels, names with leads to their parts, and distances."""
 
 from collections.abc import Callable, Iterable, Iterator
-from html import escape
 
 from hardware.parts.view import Drawn
-from services.plot import STYLE, line, text
+from services.plot import document, line, text
 
 STYLE_HERE = """
   path { stroke: #1d2330; stroke-linejoin: round; fill-rule: evenodd; vector-effect: non-scaling-stroke; }
@@ -41,20 +40,9 @@ class Sheet:
     def document(self, body: list[str], over: list[str]) -> str:
         """Shapes in mm below, words in pixels above them."""
         x, y = self.at((0, 0))
-        return "\n".join(
-            [
-                f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.wide} {self.tall}" '
-                f'width="{self.wide}" height="{self.tall}" role="img" aria-labelledby="title">',
-                f'<title id="title">{escape(self.title)}</title><style>{STYLE}{STYLE_HERE}</style>',
-                f'<rect class="ground" width="{self.wide}" height="{self.tall}"/>',
-                f'<g transform="translate({x:.1f} {y:.1f}) scale({self.scale:g})">',
-                *body,
-                "</g>",
-                text(24, 32, self.title, "title"),
-                *over,
-                "</svg>\n",
-            ]
-        )
+        group = f'<g transform="translate({x:.1f} {y:.1f}) scale({self.scale:g})">'
+        elements = [group, *body, "</g>", text(24, 32, self.title, "title"), *over]
+        return document(self.wide, self.tall, self.title, "", elements, STYLE_HERE)
 
     def measure(self, begin: tuple[float, float], end: tuple[float, float]) -> str:
         """A line between two places along one axis, with a tick at each end."""

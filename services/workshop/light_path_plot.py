@@ -1,13 +1,12 @@
 """Scale drawing (SVG) of the light path of one design; below it the part from iris to sensor, five times larger."""
 
-from html import escape
 from itertools import pairwise
 from math import hypot
 
 from device.optics.budget import Design, OpticalBudget, Side, optical_budget
 from device.optics.light_path import Place, led_ray_mm, planes_mm, ray_mm
 from device.optics.matrix import led_positions_mm, ring
-from services.plot import LETTER_PX, LINE_PX, STYLE, Box, line, text
+from services.plot import LETTER_PX, LINE_PX, Box, document, line, polyline, text
 
 STYLE_HERE = """
   .part { fill: none; stroke: #1d2330; stroke-width: 2; } .glass { fill: #cfe3f5; stroke: #4a6b8a; }
@@ -30,18 +29,7 @@ def draw_light_path(design: Design) -> str:
         f" {budget.extent_mm:.2f} mm wide; its short side has {budget.short.sensor_mm:.2f} mm."
     )
     inner = [*_parts(design, budget), *_rays(design), *_enlargement(design, budget), *_labels(_part_labels(design))]
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {TALL}" width="{WIDE}" height="{TALL}" '
-            'role="img" aria-labelledby="plot-title plot-desc">',
-            f'<title id="plot-title">{escape(title)}</title><desc id="plot-desc">{escape(description)}</desc>',
-            f"<style>{STYLE}{STYLE_HERE}</style>",
-            f'<rect class="ground" width="{WIDE}" height="{TALL}"/>',
-            text(24, 32, title, "title"),
-            *inner,
-            "</svg>\n",
-        ]
-    )
+    return document(WIDE, TALL, title, description, [text(24, 32, title, "title"), *inner], STYLE_HERE)
 
 
 def _at(place: Place) -> Place:
@@ -49,8 +37,7 @@ def _at(place: Place) -> Place:
 
 
 def _stroke(kind: str, *places: Place) -> str:
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in map(_at, places))
-    return f'<polyline class="{kind}" points="{points}"/>'
+    return polyline(map(_at, places), kind)
 
 
 def _parts(design: Design, budget: OpticalBudget) -> list[str]:

@@ -31,7 +31,7 @@ from device.optics.light_budget import (
 )
 from device.optics.matrix import inner_ring_at_pupil_mm, ring
 from device.values import Illumination
-from services.plot import STYLE, line, text
+from services.plot import document, line, rectangle, text
 from services.workshop import light_tolerances
 
 GUARD = 1.3  # factor of a measured ring, the least that a head file may have
@@ -276,12 +276,8 @@ def gains_svg(design: Design, frames: int = 1) -> str:
     for cause, gain in gains.items():
         long = max(1.0, scale * log10(min(gain, 100.0)))
         parts.append(text(LEFT - 8, y + 5, cause, "small", "end"))
-        parts.append(f'<rect class="mark s1" x="{LEFT}" y="{y - 8:.1f}" width="{long:.1f}" height="16"/>')
+        parts.append(rectangle(LEFT, y - 8, long, 16, "mark s1"))
         parts.append(text(LEFT + long + 8, y + 5, f"x {gain:.1f}", "small"))
         y += BAR
     parts.append(line(LEFT, 78, LEFT, y - 10, "frame"))
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {y:.0f}" role="img" '
-        f'aria-label="Possible gains of light by cause"><style>{STYLE}</style>'
-        f'<rect class="ground" width="{WIDE}" height="{y:.0f}"/>{"".join(parts)}</svg>\n'
-    )
+    return document(WIDE, y, "Possible gains of light by cause", f"{design.title}: {light}", parts)

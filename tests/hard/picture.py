@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from services.plot import STYLE, text
+from services.plot import document, rectangle, text
 from tests.hard.cases import CASES, NAMED
 from tests.hard.cells import Cell
 from tests.hard.judgement import Violation, explanation, lost
@@ -46,19 +46,10 @@ def _document(eye: str, columns: Sequence[str], inner: Sequence[str], y: int) ->
     wide, tall = LEFT + len(columns) * WIDE + 150, y + 24
     heads = [text(LEFT + (k + 0.5) * WIDE, TOP - 10, name, "small", "middle") for k, name in enumerate(columns)]
     heads.append(text(LEFT + len(columns) * WIDE + 8, TOP - 10, "refraction error", "small"))
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
-            f'role="img" aria-label="Hard cases, {escape(eye)}"><style>{STYLE}</style>',
-            f'<rect class="ground" width="{wide}" height="{tall}"/>',
-            text(20, 32, f"Hard cases: {eye}", "title"),
-            *(text(20, 56 + 18 * k, line, "quiet small") for k, line in enumerate(LEGEND)),
-            *_scale(),
-            *heads,
-            *inner,
-            "</svg>\n",
-        ]
-    )
+    legend = [text(20, 56 + 18 * k, line, "quiet small") for k, line in enumerate(LEGEND)]
+    title = f"Hard cases: {eye}"
+    elements = [text(20, 32, title, "title"), *legend, *_scale(), *heads, *inner]
+    return document(wide, tall, title, " ".join(LEGEND), elements)
 
 
 def _scale() -> list[str]:
@@ -85,10 +76,8 @@ def _cell(cell: Cell, x: int, y: int, broken: bool) -> list[str]:
         _label(x + WIDE / 2 - 1, y + TALL - 8, words, ink),
     ]
     if broken:
-        out.append(
-            f'<rect x="{x + 1}" y="{y + 1}" width="{WIDE - GAP - 2}" height="{TALL - GAP - 2}" fill="none" '
-            'stroke="#e00000" stroke-width="3"/>'
-        )
+        style = "fill: none; stroke: #e00000; stroke-width: 3"
+        out.append(rectangle(x + 1, y + 1, WIDE - GAP - 2, TALL - GAP - 2, style=style))
     return [*out, "</g>"]
 
 
@@ -101,7 +90,7 @@ def _refraction(cell: Cell) -> str:
 
 
 def _box(x: float, y: float, wide: float, tall: float, colour: str) -> str:
-    return f'<rect x="{x:g}" y="{y:g}" width="{wide:g}" height="{tall:g}" fill="{colour}"/>'
+    return rectangle(x, y, wide, tall, style=f"fill: {colour}")
 
 
 def _label(x: float, y: float, words: str, ink: str) -> str:

@@ -21,7 +21,7 @@ from device.optics.traced_relay import (
     without_rims,
 )
 from services import resources
-from services.plot import STYLE, line, text
+from services.plot import document, line, polyline, text
 from tests.paper.bench import Bench
 from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, attempted, below, within
 from tests.paper.pictures import trend
@@ -236,21 +236,16 @@ def _drawing(relay: TracedRelay, path: LightPath) -> Figure:
         heights = np.linspace(-relay.pupil_mm / 2, relay.pupil_mm / 2, 5)
         start = np.column_stack([np.zeros(5), heights, np.zeros(5)])
         through = paths((*surfaces, iris), rays(start, np.array([0, sin(out), cos(out)])))
-        lines = "".join(f'<polyline class="ray" points="{_points(through[:, k])}"/>' for k in range(5))
+        lines = "".join(polyline(_places(through[:, k]), "ray") for k in range(5))
         inner.append(f'<g class="{kind}">{lines}</g>')
     words = "; ".join(f"{angle:g}" for angle in DRAWN_DEG)
     caption = f"The traced relay to scale: beams of {words} degrees from the pupil to the iris"
-    style = STYLE + (
+    style = (
         ".ray { fill: none; stroke: var(--ink); stroke-width: 1; opacity: .8; }"
         ".stop { stroke: #8a8f98; stroke-width: 3; }"
         ".glass { fill: none; stroke: #4a6b8a; stroke-width: 1.5; }"
     )
-    drawn = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {TALL}" width="{WIDE}" height="{TALL}" '
-        f'role="img"><title>{caption}</title><style>{style}</style>'
-        f'<rect class="ground" width="{WIDE}" height="{TALL}"/>{text(24, 28, caption, "title")}'
-        f"{''.join(inner)}</svg>"
-    )
+    drawn = document(WIDE, TALL, caption, "", [text(24, 28, caption, "title"), *inner], style)
     return Figure(caption, f"data:image/svg+xml;base64,{b64encode(drawn.encode()).decode()}", wide=True)
 
 
@@ -259,11 +254,11 @@ def _outline(surface: Surface) -> str:
     heights = np.linspace(-surface.clear_mm / 2, surface.clear_mm / 2, 41)
     sag = surface.radius_mm - np.sign(surface.radius_mm) * np.sqrt(surface.radius_mm**2 - heights**2)
     places = np.column_stack([np.zeros(41), heights, surface.at_mm + sag])
-    return f'<polyline class="glass" points="{_points(places)}"/>'
+    return polyline(_places(places), "glass")
 
 
-def _points(places: np.ndarray) -> str:
-    return " ".join(f"{LEFT + SCALE * z:.1f},{AXIS - SCALE * y:.1f}" for _, y, z in places)
+def _places(places_mm: np.ndarray) -> list[tuple[float, float]]:
+    return [(LEFT + SCALE * z, AXIS - SCALE * y) for _, y, z in places_mm]
 
 
 EXPERIMENTS = (
