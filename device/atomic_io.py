@@ -11,6 +11,7 @@ import fcntl
 import math
 import os
 import shutil
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -54,6 +55,16 @@ def make_folder(folder: Path, mode: int | None = PRIVATE_FOLDER) -> None:
         make_folder(folder.parent, mode)
         _make_one(folder, mode, exist_ok=True)
         fsync_folder(folder.parent)
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder durably, or take the rights of other users from an existing one.
+
+    PermissionError if it belongs to another user, who alone may do that.
+    """
+    make_folder(folder)
+    if (mode := stat.S_IMODE(folder.stat().st_mode)) & 0o077:
+        folder.chmod(mode & 0o700)
 
 
 def _make_one(folder: Path, mode: int | None, exist_ok: bool = False) -> None:

@@ -140,7 +140,7 @@ def _expected() -> Iterator[None]:
         yield
     except DiffuscopeError:
         raise
-    except Exception as error:
+    except Exception as error:  # of any kind: otherwise the boot would end without its report
         message = f"the settings cannot be used: {type(error).__name__}: {error}"
         raise SpecError(message, f"Write {FILE} onto the card again. If this stays, call the technician.") from error
 

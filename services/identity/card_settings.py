@@ -6,6 +6,7 @@ reported and changes nothing.
 
 import re
 import tomllib
+from contextlib import suppress
 from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from typing import Self
@@ -23,6 +24,7 @@ FILE = "diffuscope.toml"
 UPDATES = "update.toml"  # of the update server, put onto the data partition by SSH
 COUNTRIES = "iso3166.tab"  # of tzdata: a line for each country, its code first
 PASSWORD = re.compile(rb'^([ \t]*password[ \t]*=[ \t]*)(["\'])(.*?)\2', re.MULTILINE)
+READABLE = re.compile(rb"""password[ \t]*=[ \t]*["']*[^\s"'*]""")  # also where the file cannot be read
 KEPT = re.compile(r"\*+")  # what is left of a password on the first partition
 
 
@@ -82,7 +84,8 @@ def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> Diffusc
     `boot`: folder of `diffuscope.toml`; `release`: folder of the installed program; `zones`: folder of the time zones.
     Without a file nothing changes. After an error the kept settings are as before. Of the files beside, `kept` has
     those that the settings name (`named_files`); others that it had before are removed. The password on the boot
-    partition is overwritten after the settings are durable, so that a power cut loses neither.
+    partition is overwritten after the settings are durable, so that a power cut loses neither. That of a file which is
+    not taken stays, since nothing else has it; the remedy says so.
     """
     source = boot / FILE
     if not source.exists():
@@ -93,18 +96,26 @@ def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> Diffusc
         if settings.wifi is not None and settings.wifi.password:
             content = _with_known_password(content, settings.wifi, kept)
         beside = _files_beside(settings, boot, release, zones)
-        atomic_io.make_folder(kept)
-        kept.chmod(0o700)
+        atomic_io.make_private(kept)
         for name, text in beside.items():
             atomic_io.write_atomically(kept / name, text)
         atomic_io.write_atomically(kept / FILE, content)
         _overwrite_password(source)
         _forget(kept, {FILE, UPDATES, *beside})
     except DiffuscopeError as error:
-        return error
+        return SpecError(error.message, f"{error.remedy}{_readable_password(source)}")
     except OSError as error:
-        return SpecError(f"{FILE} cannot be kept: {error}", "Make room on the card, or write the card again.")
+        remedy = f"Make room on the card, or write the card again.{_readable_password(source)}"
+        return SpecError(f"{FILE} cannot be kept: {error}", remedy)
     return None
+
+
+def _readable_password(source: Path) -> str:
+    """Return the sentence on a password that the file still holds, in any encoding; "" without one."""
+    with suppress(OSError):
+        if READABLE.search(source.read_bytes().replace(b"\0", b"")):
+            return f" {FILE} still holds the Wi-Fi password, readable for everybody who has the card."
+    return ""
 
 
 def kept_settings(kept: Path) -> CardSettings:

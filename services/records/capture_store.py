@@ -93,6 +93,7 @@ class CaptureStore:
         self._captures, self._lock = folder / "captures", folder / ".lock"
         database, torn = folder / schema.DATABASE, folder / "torn"
         with storage_errors(), ExitStack() as cleanup:
+            _make_private(folder)
             atomic_io.make_folder(self._captures)
             atomic_io.make_folder(torn)
             snapshots = Snapshots(database, clock or SystemClock(), free_bytes)
@@ -297,6 +298,21 @@ class CaptureStore:
         for folder in folders:
             if folder.exists():
                 raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
+
+
+def _make_private(folder: Path) -> None:
+    """Make the folder of the store, or take the rights of other users from it; unchanged where nothing can be written.
+
+    StoreError if it belongs to another user, who alone may do that.
+    """
+    if folder.exists() and not os.access(folder, os.W_OK):
+        return
+    try:
+        atomic_io.make_private(folder)
+    except PermissionError as error:
+        message = f"other users may read the folder {folder.name}, which belongs to one of them"
+        remedy = "Give it to the user of this program (chown), or choose another with --data."
+        raise StoreError(message, remedy) from error
 
 
 def _refuse_read_only(*folders: Path) -> None:

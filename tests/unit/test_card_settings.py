@@ -214,6 +214,29 @@ def test_settings_in_another_encoding_are_named_and_a_mark_is_read(card: CardBoo
     assert problem is not None
     assert re.search(expected, problem.message)
     assert "UTF-8" in problem.remedy
+    assert "still holds the Wi-Fi password" in problem.remedy
+
+
+@pytest.mark.parametrize(
+    ("content", "holds"),
+    [
+        (GOOD.replace("KE", "UK"), True),
+        ('wifi = { name = "Clinic", password = "ganga 2026" }', True),
+        ("[wifi]\npassword = ganga2026\n", True),
+        (GOOD.replace("KE", "UK").replace(PASSWORD, "*" * 10), False),
+        ('country = "UK"\n', False),
+        ('[wifi]\nname = "Clinic"\npassword = ""\ncolour = 1\n', False),
+    ],
+)
+def test_a_refused_file_keeps_its_password_and_the_report_says_so(card: CardBoot, content: str, holds: bool) -> None:
+    """Nothing else has the password of a file that was not taken."""
+    file = write(card, content)
+    problem = card.run()
+    assert problem is not None
+    assert ("still holds the Wi-Fi password" in problem.remedy) is holds
+    assert "still holds" in (card.root / "run/issue.d/settings.issue").read_text() or not holds
+    assert PASSWORD not in problem.message + problem.remedy
+    assert file.read_text() == content
 
 
 @pytest.mark.parametrize("broken", ["kept", "zone", "ssh"])

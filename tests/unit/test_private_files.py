@@ -83,6 +83,17 @@ def test_an_identity_is_private_with_any_umask(umask: int, tmp_path: Path) -> No
     assert modes(tmp_path / "data") == {}
 
 
+@pytest.mark.parametrize("mode", [0o755, 0o770, 0o2775])
+def test_an_existing_data_folder_becomes_private(tmp_path: Path, mode: int) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    data.chmod(mode)
+    tmp_path.chmod(0o755)
+    CaptureStore(data, reserve_bytes=0).close()
+    assert modes(data) == {}
+    assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o755, "the folder around it stays as it is"
+
+
 def test_a_database_that_others_could_read_becomes_private(tmp_path: Path) -> None:
     CaptureStore(tmp_path / "data", reserve_bytes=0).close()
     (tmp_path / "data/shelf.sqlite").chmod(0o644)

@@ -1,5 +1,6 @@
 """A store that belongs to another user, and two programs on one store."""
 
+import encodings.utf_8_sig  # noqa: F401  # another user may not be able to load it later
 import multiprocessing
 import os
 import sqlite3
@@ -82,7 +83,7 @@ def test_a_store_of_another_user_is_a_clear_error_and_stays_as_it_was(
     before = {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))}
 
     def open_it() -> None:
-        with pytest.raises(StoreError, match=r"refused: .*([Pp]ermission|readonly|open)"):
+        with pytest.raises(StoreError, match=r"refused: .*([Pp]ermission|readonly|open)|other users may"):
             CaptureStore(folder, reserve_bytes=0)
 
     assert run_as(OTHER_USER_ID, open_it) == 0
@@ -117,6 +118,22 @@ def test_a_store_that_may_only_be_read_is_shown_and_takes_nothing(folder: Path) 
     with opened_store(folder, VirtualClock()) as store:
         assert [one.id for one in store.captures()] == ["mine"]
         assert store.refusal is None
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+@pytest.mark.filterwarnings("ignore:This process.*fork:DeprecationWarning")  # the child starts no thread
+def test_a_folder_of_another_user_that_all_may_write_is_refused() -> None:
+    with tempfile.TemporaryDirectory() as place:
+        Path(place).chmod(0o777)
+
+        def open_it() -> None:
+            with pytest.raises(StoreError, match="other users may read") as raised:
+                CaptureStore(Path(place), reserve_bytes=0)
+            assert "--data" in raised.value.remedy
+            assert not isinstance(raised.value, StoreReadOnly)
+
+        assert run_as(OTHER_USER_ID, open_it) == 0
+        assert list(Path(place).iterdir()) == []
 
 
 def test_an_error_that_is_not_of_the_disk_does_not_open_the_store_for_reading(folder: Path) -> None:
