@@ -1,12 +1,12 @@
 """Sequences of frames: several frames in one illumination, or a lit and a dark frame of each colour."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from device.clock import Clock
 from device.errors import LightCut
 from device.light_safety.guard import GuardedLight
-from device.ports import Camera, Light
-from device.values import EYES, Colour, ExposureSettings, Eye, Frame, Illumination
+from device.ports import Camera
+from device.values import EYES, ExposureSettings, Eye, Frame, Illumination
 
 ROUNDING_S = 1e-6  # of sums of durations
 
@@ -65,20 +65,6 @@ def _whole_s(part_s: float, longest_s: float, parts: int, whole_s: float | None)
     if whole_s is None:
         return parts * part_s + overhead_s
     return whole_s + min(overhead_s, (whole_s - parts * part_s) / (parts - 1))
-
-
-def colour_sequence(
-    camera: Camera, light: Light, illuminations: Sequence[Illumination], shot: ExposureSettings
-) -> Iterator[tuple[Colour, Frame, Frame]]:
-    """Yield for each illumination its colour, a lit frame, and the dark frame taken right after it.
-
-    Red, green, red again shows the movement of an eye (OPTICS.md 4.5). The lamp is dark between two colours. Raises
-    LightCut if the guard ends a light early.
-    """
-    for glow in illuminations:
-        with light.on(glow):
-            frame = require_lit(camera.expose(shot))
-        yield glow.colour, frame, camera.expose(shot)
 
 
 def require_lit(frame: Frame) -> Frame:

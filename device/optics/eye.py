@@ -5,10 +5,9 @@ design" and "Hardware design". Contradictions in the paper: `decisions/` of this
 """
 
 from dataclasses import dataclass
-from math import acos, asin, atan, degrees, hypot, pi, radians, sin, sqrt, tan
+from math import acos, asin, atan, degrees, pi, radians, sin, sqrt, tan
 
 CORNEA_RADIUS_MM = 7.8
-CORNEA_INDEX = 1.376
 # Series through the ray trace of the real lenses, in powers of the half field over 30 degrees (OPTICS.md 6.3, 6.4);
 # tests/physics/test_traced_relay.py compares them with the trace up to TRACED_TO_DEG.
 TRACED_TO_DEG = 31.0
@@ -153,19 +152,6 @@ def iris_overlap(shift_mm: float, beam_mm: float, iris_mm: float) -> float:
     return lens / (pi * r * r)
 
 
-def petzval_mm(focal_length_mm: float = 25.0, index: float = 1.517) -> tuple[float, float]:
-    """Return the radii of the sagittal and tangential image surfaces of a thin lens, mm: f/(1 + 1/n), f/(3 + 1/n).
-
-    The stop is at the lens.
-    """
-    return focal_length_mm / (1 + 1 / index), focal_length_mm / (3 + 1 / index)
-
-
-def cornea_reflectance(index: float = CORNEA_INDEX) -> float:
-    """Return the reflectance of the cornea's first surface at normal incidence (Fresnel)."""
-    return ((index - 1) / (index + 1)) ** 2
-
-
 def reflex_free_mm(half_field_deg: float) -> float:
     """Return the least height at the pupil whose corneal reflex falls outside the field, mm: R sin(theta)."""
     return CORNEA_RADIUS_MM * sin(radians(half_field_deg))
@@ -177,11 +163,6 @@ def reflex_deg(ring_radius_mm: float, half_field_deg: float) -> float:
     r = `ring_radius_mm`: radius of the LED ring's image at the eye's pupil. Inside the field if <= `half_field_deg`.
     """
     return 2 * degrees(asin(min(ring_radius_mm / CORNEA_RADIUS_MM, 1.0))) - half_field_deg
-
-
-def strongest_dpt(m_dpt: float, j0_dpt: float, j45_dpt: float) -> float:
-    """Return the absolute refraction of the strongest meridian, dpt: |M| + hypot(J0, J45)."""
-    return abs(m_dpt) + hypot(j0_dpt, j45_dpt)
 
 
 def chromatic_difference_dpt(wavelength_um: float, reference_um: float) -> float:

@@ -248,11 +248,6 @@ class FieldPoint:
     sagittal_dpt: float
     tangential_dpt: float
 
-    @property
-    def astigmatism_dpt(self) -> float:
-        """Difference of the two vergences, dpt."""
-        return self.tangential_dpt - self.sagittal_dpt
-
 
 def retina_point(
     path: LightPath, angle_deg: float, retina_radius_mm: float | None = None, eye_to_screen_mm: float | None = None

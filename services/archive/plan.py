@@ -38,11 +38,6 @@ class PlanSettings(_Part):
     rounds: int | None = None
     budget_s: float | None = None
 
-    @property
-    def is_repeatable(self) -> bool:
-        """Return whether equal input gives equal bytes on one machine."""
-        return self.budget_s is None
-
 
 class InputFile(_Part):
     """One file of a calibration, with its SHA-256."""

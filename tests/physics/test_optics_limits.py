@@ -8,8 +8,8 @@ from scipy.special import j1
 
 from device.config.head_file import load_head
 from device.optics.diffuser import Refraction, caustic_on, grid_for
-from device.optics.rays import ray_caustic
 from device.sim.render import convolved_with_disc
+from tests.textbook.rays import ray_caustic
 
 HEAD = load_head(Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml")
 OPTICS, PITCH_UM = HEAD.optics, HEAD.camera.pitch_um

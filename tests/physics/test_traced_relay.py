@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from device.errors import SpecError
-from device.optics.eye import TRACED_TO_DEG, Relay, beam_walk_mm, flat_screen_dpt, petzval_mm
+from device.optics.eye import TRACED_TO_DEG, Relay, beam_walk_mm, flat_screen_dpt
 from device.optics.field_extent import extent_mm
 from device.optics.lens_data import lens_surfaces
 from device.optics.light_path import LightPath, load_light_path
@@ -23,6 +23,7 @@ from device.optics.traced_relay import (
     retina_point,
     traced_relay,
 )
+from tests.textbook.image_surfaces import petzval_mm
 
 PATH = load_light_path(Path(__file__).parents[2] / "hardware" / "optics.toml")
 RELAY = traced_relay(PATH)

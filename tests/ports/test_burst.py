@@ -4,7 +4,7 @@ import pytest
 
 from device.errors import CameraMissing, LightLimit
 from device.head import hazard_of
-from device.light_safety.burst import burst, colour_sequence
+from device.light_safety.burst import burst
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
 from device.sim.light import SimLight
@@ -108,18 +108,6 @@ def test_an_error_between_two_frames_of_a_burst_turns_the_light_off(rig):
     with pytest.raises(CameraMissing):
         burst(UnpluggedCamera(rig.camera), guarded(rig), Illumination("green"), SHOT, 3, rig.clock)
     assert rig.light.illumination is None
-
-
-def test_each_colour_has_its_own_lit_and_dark_frame(live_rig):
-    glows = (Illumination("red", 0.5), Illumination("green", 0.5), Illumination("red", 0.5))
-    taken = list(colour_sequence(live_rig.camera, live_rig.light, glows, SHOT))
-    assert [colour for colour, _, _ in taken] == ["red", "green", "red"]
-    for _, frame, dark in taken:
-        assert dark.illumination is None
-        assert frame.counts.mean() > dark.counts.mean() + 1
-    red, green, again = (frame.counts.mean() for _, frame, _ in taken)
-    assert red == pytest.approx(again, rel=0.02)
-    assert abs(red / green - 1) > 0.05
 
 
 class CuttingCamera:
