@@ -73,6 +73,37 @@ def looks_like_mosaic(frame: NDArray[Any]) -> bool:
     return contrast > LEAST_CONTRAST and steady and float(greens) < 0.5 * contrast
 
 
+def pattern_of(
+    frame: NDArray[Any], given: BayerOption | None, stated: Bayer | None, black_dn: float, name: str
+) -> tuple[Bayer | None, tuple[str, ...]]:
+    """Return the pattern of a frame in counts, None for a monochrome one, and a note if that is not certain.
+
+    `given` by the user decides. The label of the file, `stated`, is no proof: picamera2 and rpicam-apps label the raw
+    of a monochrome sensor as a mosaic. Pixels that are too few to decide are taken as labelled. FrameError for a
+    pattern that is given for a frame with channels.
+    """
+    if given == "none" or frame.ndim == 3:
+        if given not in (None, "none"):
+            raise FrameError(f"{name} has three channels, so it is no mosaic", "Leave --bayer out.")
+        return None, ()
+    if given is not None:
+        return given, ()
+    mosaic = looks_like_mosaic(frame.astype(np.float32) - black_dn)
+    if stated is not None and (mosaic or min(frame.shape) < MIN_SIZE):
+        return stated, ()
+    if stated is not None:
+        return None, (
+            f"{name} is labelled as a colour mosaic ({stated}), but its pixels are those of a monochrome sensor. "
+            f"It was taken as grey. Give --bayer {stated} if it is a mosaic; --bayer none leaves out this note.",
+        )
+    if mosaic:
+        return None, (
+            f"{name} looks like a colour mosaic and was taken as grey. Give --bayer with one of {', '.join(PATTERNS)}; "
+            "none leaves out this note.",
+        )
+    return None, ()
+
+
 def whole_size(picture: Image, shape: tuple[int, int]) -> Image:
     """Return a picture of planes at the rows and columns `shape` of its mosaic, float32, by linear interpolation.
 

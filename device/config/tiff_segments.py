@@ -22,6 +22,8 @@ Pixels = NDArray[Any]
 MAX_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
 MAX_COMPRESSION_RATIO = 1100  # maximum compression ratio of a deflated black frame (zlib: 1032)
 _NONE, _LZW, _DEFLATE, _OLD_DEFLATE, _PACK_BITS, _LZMA, _ZSTD = 1, 5, 8, 32946, 32773, 34925, 50000
+_LOSSY, _JPEG = (6, 34892), 7  # JPEG: with loss, but for raw images, in which it is lossless
+_OF_RAW = (tifffile.PHOTOMETRIC.CFA, tifffile.PHOTOMETRIC.LINEAR_RAW)
 _OF_LIBTIFF = (_LZW, _PACK_BITS, _LZMA, _ZSTD)
 _PREDICTED = (_LZW, _DEFLATE, _OLD_DEFLATE, _LZMA, _ZSTD)  # codecs that a predictor may precede
 _KINDS = {1: "u", 2: "i", 3: "f", 4: "u"}  # of SampleFormat; "undefined" (4) is read as unsigned (TIFF 6.0, page 80)
@@ -81,6 +83,8 @@ def _dtype(page: tifffile.TiffPage, name: str) -> np.dtype[Any]:
 def _refuse_coding(page: tifffile.TiffPage, name: str) -> None:
     """Raise FrameError for a compression, predictor or bit order that cannot be undone."""
     code, remedy = int(page.compression), "Save it without compression, or with LZW or deflate."
+    if code in _LOSSY or (code == _JPEG and page.photometric not in _OF_RAW):
+        raise FrameError(f"{name} is compressed by {_codec(code)}, which changes the counts", remedy)
     if code not in (_NONE, *_PREDICTED, *_OF_LIBTIFF) or (code in _OF_LIBTIFF and not features.check("libtiff")):
         raise FrameError(f"{name} is compressed by {_codec(code)}, and its decoder is missing here", remedy)
     predictor, whole = int(page.predictor), page.bitspersample in (8, 16, 32, 64)

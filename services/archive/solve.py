@@ -168,10 +168,7 @@ class Solvers:
         except REFUSED as error:
             remedy = f"{error.remedy} {AGAIN}".strip()
             return Quarantined(name, error.code, error.message.replace(f"{spool}/raw/", ""), remedy)
-        report = solved.made.report
-        warnings = tuple(one.replace(f"{spool}/raw/", "") for one in report.warnings)  # the copies are temporary
-        made = replace(solved.made, report=replace(report, warnings=warnings))
-        return _Made(replace(solved, made=made), _facts(stated_by(frames.lit[0])), scores)
+        return _Made(solved, _facts(stated_by(frames.lit[0])), scores)
 
     def _solver(self, task: Task) -> CaptureReconstructor:
         key = task.calibration.digest, digest_of(task.settings.model_dump())  # a worker may outlive a plan

@@ -80,7 +80,7 @@ def unusable_raws(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
     reasons = {}
     for k, one in enumerate(loaded):
         try:
-            refuse_without_signal(one.raw, one.name)
+            refuse_without_signal(one.raw, one.label)
         except FrameError as error:
             reasons[k] = error.message
     return reasons
@@ -131,7 +131,7 @@ def without_bad(raw: Raw) -> Pixels:
 def rejections(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> tuple[str, ...]:
     """Return a note for each raw that is not used."""
     return tuple(
-        f"{one.name} was left out: {use.reason}." for one, use in zip(loaded, frames, strict=True) if not use.used
+        f"{one.label} was left out: {use.reason}." for one, use in zip(loaded, frames, strict=True) if not use.used
     )
 
 

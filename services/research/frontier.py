@@ -94,7 +94,8 @@ class Case:
     """One frame with its truth: the data in memory before a timed run.
 
     `vessels` is the mask of the vessels, None if unknown. `registered`: the truth has its own origin, and one common
-    shift registers all pictures with it. `light`: bursts of a scene, None if they are not measured.
+    shift registers all pictures with it. `light`: bursts of a scene, None if they are not measured. `notes` are
+    sentences for the user.
     """
 
     name: str
@@ -104,6 +105,7 @@ class Case:
     calibration: Calibration
     registered: bool
     light: LightCase | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -155,6 +157,8 @@ def selected_methods(names: Sequence[str]) -> Mapping[str, Method]:
 
 def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer | None) -> Frontier:
     case = bench.case
+    for note in case.notes:
+        bench.progress(f"note: {note}")
     points, choice = bench.measure(budget_s, repeats)
     front = pareto_front([(p.seconds_median, p.psnr_db) for p in points])
     points = tuple(replace(point, pareto=on) for point, on in zip(points, front, strict=True))
@@ -519,12 +523,17 @@ def recorded_case(
     field_deg: float | None,
     plans: Path | None,
 ) -> Case:
-    """Return a recorded frame with its truth, files or arrays; FrameError for a truth of another shape.
+    """Return a recorded frame with its truth, files or arrays; FrameError for a mosaic, or a truth of another shape.
 
     `head`, `field_deg`: as in `ReconstructOptions`. `plans`: folder of cached FFT plans.
     """
     pixels = _grey((read_image(truth) if isinstance(truth, Path) else np.asarray(truth)).astype(np.float32))
     frame = load_raw(raw)
+    if frame.bayer is not None:
+        raise FrameError(
+            f"{frame.name} is a colour mosaic ({frame.bayer}), and a frontier measures one channel",
+            "Give raw, PSF and truth of a monochrome sensor, or of one colour plane, as npy.",
+        )
     if pixels.shape != frame.shape:
         raise FrameError(
             f"{name_of(truth, 'the truth')} has {pixels.shape[0]} x {pixels.shape[1]} pixels, "
@@ -534,4 +543,4 @@ def recorded_case(
     file = raw.pixels if isinstance(raw, Raw) else raw
     options = ReconstructOptions(file, (psf,), None, None, None, None, None, head, field_deg, False, plans)
     name = raw.name if isinstance(raw, Path) else frame.name
-    return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame), True)
+    return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame), True, notes=frame.notes)

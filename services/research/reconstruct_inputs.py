@@ -98,6 +98,11 @@ class LoadedRaw:
     light: Colour | None = None
 
     @property
+    def label(self) -> str:
+        """Name for sentences of a report: that of the file without its folders, which others may read."""
+        return Path(self.name).name
+
+    @property
     def solved_shape(self) -> Shape:
         """(rows, cols) of `raw`."""
         rows, cols = self.raw.pixels.shape[:2]
@@ -157,42 +162,11 @@ def load_raw(source: RawSource, pattern: BayerOption | None = None, checked: boo
     if checked:
         refuse_without_signal(raw, name)
     rows, cols = raw.pixels.shape[:2]
-    pattern, notes = _pattern(raw, pattern, file.levels.bayer, black_dn or 0.0, name)
+    pattern, notes = bayer.pattern_of(raw.pixels, pattern, file.levels.bayer, black_dn or 0.0, Path(name).name)
     if pattern is not None:
         planes = bayer.split(raw.pixels, pattern, raw.white_dn)
         raw = replace(raw, pixels=planes, bad=bayer.any_site(raw.bad))
     return LoadedRaw(raw, name, (rows, cols), pattern, black_dn, is_simulated(source), notes)
-
-
-def _pattern(
-    raw: Raw, given: BayerOption | None, stated: Bayer | None, black_dn: float, name: str
-) -> tuple[Bayer | None, tuple[str, ...]]:
-    """Return the pattern with which a raw is split, None for a monochrome one, and a note if that is not certain.
-
-    `given` by the user decides. The label of the file, `stated`, is no proof: picamera2 and rpicam-apps label the raw
-    of a monochrome sensor as a mosaic. Pixels that are too few to decide are taken as labelled.
-    """
-    if given == "none" or raw.pixels.ndim == 3:
-        if given not in (None, "none"):
-            raise FrameError(f"{name} has three channels, so it is no mosaic", "Leave --bayer out.")
-        return None, ()
-    if given is not None:
-        return given, ()
-    mosaic = bayer.looks_like_mosaic(raw.pixels.astype(np.float32) - black_dn)
-    if stated is not None and (mosaic or min(raw.pixels.shape) < bayer.MIN_SIZE):
-        return stated, ()
-    if stated is not None:
-        return None, (
-            f"{name} is labelled as a colour mosaic ({stated}), but its pixels are those of a monochrome sensor. "
-            f"It was solved as grey. Give --bayer {stated} if it is a mosaic; --bayer none leaves out this note.",
-        )
-    if mosaic:
-        choice = ", ".join(bayer.PATTERNS)
-        return None, (
-            f"{name} looks like a colour mosaic and was solved as grey. Give --bayer with one of {choice}; "
-            "none leaves out this note.",
-        )
-    return None, ()
 
 
 def _read(source: RawSource, name: str) -> ImageFile:
@@ -263,7 +237,7 @@ def swap_notes(loaded: LoadedRaw, psfs: LoadedPsfs) -> tuple[str, ...]:
     if concentration(pixels) <= SWAPPED * concentration(psfs.stacks[0][0].pixels):
         return ()
     return (
-        f"{loaded.name} looks like a PSF and {psfs.stacks[0][0].name} like a raw frame: they seem to be swapped. "
+        f"{loaded.label} looks like a PSF and {psfs.stacks[0][0].name} like a raw frame: they seem to be swapped. "
         "Give the raw first and the PSF with --psf.",
     )
 

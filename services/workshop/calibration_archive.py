@@ -13,6 +13,7 @@ from device.errors import CalibrationError, HeadMismatch, MemoryDamaged
 from device.head import head_memory, refuse_unsuitable_calibration
 from device.ports import HeadMemory
 from device.values import HeadIdentity
+from services.research.reconstruct_file import parse_bayer
 from services.workshop.calibration_words import details, printable, summary
 
 app = typer.Typer(
@@ -182,14 +183,20 @@ def import_psf(
     pitch_um: Annotated[float | None, typer.Option(min=0.1, max=100, help="Pixel pitch of the sensor.")] = None,
     black_dn: Annotated[float | None, typer.Option(min=0, max=65535, help="Count without light.")] = None,
     white_dn: Annotated[float | None, typer.Option(min=1, max=65535, help="Count at which the sensor ends.")] = None,
+    bayer: Annotated[
+        str | None, typer.Option(metavar="RGGB", help="none: the images are monochrome, whatever a dng says.")
+    ] = None,
 ) -> None:
-    """Archive a PSF of another laboratory, its unknown values marked as unknown; it is not put in force."""
+    """Archive a PSF of another laboratory, its unknown values marked as unknown; it is not put in force.
+
+    A PSF of a colour mosaic is refused: the pixels decide, not the label of a dng.
+    """
     from importlib.metadata import version
 
     from device.calibration.archive import Provenance
     from device.calibration.import_psf import ImportedPsfInfo, read_imported_psf
 
-    found = read_imported_psf(tuple(psf), ImportedPsfInfo(black_dn, white_dn, pitch_um, dark))
+    found = read_imported_psf(tuple(psf), ImportedPsfInfo(black_dn, white_dn, pitch_um, dark, parse_bayer(bayer)))
     provenance = Provenance(
         "unknown",
         SystemClock().wall(),
@@ -205,3 +212,5 @@ def import_psf(
     id = kept.add(found.calibration, provenance)
     for line in summary(kept.load(id)):
         typer.echo(line)
+    for note in found.notes:
+        typer.echo(f"note: {note}", err=True)

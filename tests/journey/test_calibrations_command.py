@@ -15,12 +15,15 @@ from device.errors import HeadMismatch
 from device.head import HeadOpener
 from services.cli import main
 from tests.journey.conftest import Diffuscope
+from tests.journey.test_reconstruct_options import caustic, mosaic_dng, write_dng
+from tests.journey.wrong_inputs import call
 from tests.project_files import ROOT
 from tests.scenes import speckle
 from tests.unit.test_archive import WHO, calibration
 
 Say = Callable[..., str]
 SHAPE = (96, 128)
+WHOSE = ("--by", "Ana", "--source", "a laboratory")
 
 
 @pytest.fixture
@@ -234,6 +237,20 @@ def test_active_calibration_is_used_and_invalid_names_are_refused(
         ("--calibration", tmp_path / "nowhere"): "no calibration is in force",
     }.items():
         assert expected in refused(*raw, *words)
+
+
+def test_a_psf_of_a_mosaic_is_asked_as_a_raw_is(run_command, refused, tmp_path):
+    """The pixels decide; a label alone is no mosaic, and --bayer none says so."""
+    mono = write_dng(tmp_path / "mono.dng", caustic())
+    answer = call(["calibrations", "import-psf", str(mono), "--archive", str(tmp_path / "a"), *WHOSE])
+    assert answer.code == 0, answer.err
+    assert "labelled as a colour mosaic (bggr), but its pixels are those of a monochrome sensor" in answer.err
+    quiet = call(["calibrations", "import-psf", str(mono), "--archive", str(tmp_path / "a"), "--bayer", "none", *WHOSE])
+    assert (quiet.code, quiet.err) == (0, "")
+    mosaic = mosaic_dng(tmp_path / "mosaic.dng")
+    kept = Archive(tmp_path / "b")
+    assert "mosaic.dng is a colour mosaic (bggr)" in refused("import-psf", mosaic, "--archive", kept.root, *WHOSE)
+    assert not kept.ids()
 
 
 def test_stack_is_imported_as_one_calibration_with_its_dark_frame(run_command, refused, theirs, tmp_path):

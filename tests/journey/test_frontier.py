@@ -13,6 +13,8 @@ import pytest
 
 from device.recon.methods import METHODS
 from services.cli import main
+from tests.journey.test_reconstruct_options import caustic, mosaic_dng, scene
+from tests.journey.wrong_inputs import call
 
 ROOT = Path(__file__).parents[2]
 COMMAND = str(Path(sys.executable).parent / "diffuscope")
@@ -148,3 +150,14 @@ def test_impossible_measurement_is_refused(
     printed = capsys.readouterr().err
     assert says in printed
     assert not (tmp_path / "f.json").exists()
+
+
+def test_a_colour_mosaic_is_refused_as_one(tmp_path: Path) -> None:
+    raw = mosaic_dng(tmp_path / "mosaic.dng")
+    np.save(tmp_path / "psf.npy", caustic())
+    np.save(tmp_path / "truth.npy", scene())
+    words = ["--raw", str(raw), "--psf", str(tmp_path / "psf.npy"), "--truth", str(tmp_path / "truth.npy")]
+    outputs = ["--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.svg"), "--no-peers"]
+    answer = call(["frontier", *words, *outputs])
+    assert answer.code == 2
+    assert "mosaic.dng is a colour mosaic (bggr)" in answer.err

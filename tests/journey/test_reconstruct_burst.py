@@ -55,9 +55,12 @@ def test_a_burst_gives_one_picture_and_its_report_names_every_frame(folder: Path
 def test_a_frame_without_values_is_left_out_and_a_smaller_one_is_refused(folder: Path) -> None:
     done = call(reconstruct(folder, "0.npy", "nan.npy", "1.npy"))
     assert done.code == 0, done.err
-    report = json.loads((folder / "report.json").read_text())
+    text = (folder / "report.json").read_text()
+    report = json.loads(text)
     assert [one["used"] for one in report["frames"]] == [True, False, True]
     assert "not numbers" in report["frames"][1]["reason"]
+    assert any(one.startswith("nan.npy was left out") for one in report["warnings"])
+    assert str(folder) not in text, "a report is read by others, too: it names files, not folders"
     assert "344 x 480 pixels" in refusal(call(reconstruct(folder, "0.npy", "small.npy")))
     assert "no frame of the burst can be used" in refusal(call(reconstruct(folder, "nan.npy", "nan.npy")))
 

@@ -174,10 +174,15 @@ def write_dng(path: Path, counts: Any, shift: int = 0) -> Path:
     return path
 
 
+def mosaic_dng(path: Path, shift: int = 0) -> Path:
+    """Write the scene as the mosaic of a colour sensor, and return the path."""
+    colours = np.dstack([ndimage.gaussian_filter(scene() * share, 2) for share in (1.0, 0.6, 0.3)])
+    return write_dng(path, np.rint(mosaic_of(colours, "bggr")).astype(np.uint16), shift)
+
+
 @pytest.mark.parametrize("shift", [0, 4])
 def test_label_of_a_mosaic_is_believed_only_with_the_pixels_of_one(tmp_path: Path, shift: int) -> None:
-    colours = np.dstack([ndimage.gaussian_filter(scene() * share, 2) for share in (1.0, 0.6, 0.3)])
-    mosaic = write_dng(tmp_path / "mosaic.dng", np.rint(mosaic_of(colours, "bggr")).astype(np.uint16), shift)
+    mosaic = mosaic_dng(tmp_path / "mosaic.dng", shift)
     mono = write_dng(tmp_path / "mono.dng", scene(), shift)
     assert reconstruct_file(options(mosaic, [caustic()])).report.bayer == "bggr"
     for given, label in ((None, None), ("none", None), ("bggr", "bggr")):

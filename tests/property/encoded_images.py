@@ -337,8 +337,8 @@ def without_codec(draft: Draft) -> None:
 
 
 REFUSED: dict[str, tuple[str, Callable[[Draft], None]]] = {
-    "jpeg": ("compressed by JPEG", tagged(259, "H", 7)),
-    "old jpeg": ("compressed by OJPEG", tagged(259, "H", 6)),
+    "jpeg": ("JPEG (TIFF compression 7), which changes the counts", tagged(259, "H", 7)),
+    "old jpeg": ("OJPEG (TIFF compression 6), which changes the counts", tagged(259, "H", 6)),
     "fax": ("compressed by CCITTFAX4", tagged(259, "H", 4)),
     "webp": ("compressed by WEBP", tagged(259, "H", 50001)),
     "jpeg 2000": ("compressed by", tagged(259, "H", 34712)),
@@ -449,8 +449,8 @@ def tabled(draft: Draft) -> None:
 
 
 REFUSED_DNG: dict[str, tuple[str, Callable[[Draft], None]]] = {
-    "lossless jpeg": ("compressed by JPEG", tagged(259, "H", 7)),
-    "lossy jpeg": ("compressed by", tagged(259, "H", 34892)),
+    "lossless jpeg": ("JPEG (TIFF compression 7), and its decoder is missing", tagged(259, "H", 7)),
+    "lossy jpeg": ("which changes the counts", tagged(259, "H", 34892)),
     "quad mosaic": (
         "CFARepeatPatternDim 4 x 4",
         lambda draft: draft.tags.update(
