@@ -99,7 +99,7 @@ def check_image_shape(shape: tuple[int, ...]) -> None:
         raise FrameError(f"an image has rows and columns, and three channels or none; this has the shape {shape}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Psf:
     """Point spread function (PSF): image of one retinal point on the sensor.
 

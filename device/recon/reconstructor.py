@@ -7,6 +7,7 @@ only if its measured cost fits into the time that is left.
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from math import isfinite, isinf
 from threading import Lock
@@ -40,6 +41,7 @@ from device.recon.estimation.refraction import (
 from device.recon.estimation.refraction_notation import report_of, scatter_of
 from device.recon.estimation.refraction_task import RefractionTask
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
+from device.recon.model.compiled import read_only
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.kernels import Pixels, Places
@@ -206,30 +208,33 @@ class Reconstructor:
         if min(recipe.bin for recipe in recipes) < 1:
             raise SettingError("a sample is made of at least one pixel")
         self.calibration, self.shape, self.clock, self.psf_index = calibration, shape, clock, psf_index
-        self.stages = [
-            _Stage(recipe, method_named(recipe.method, methods), calibration, shape, planner, psf_index)
-            for recipe in recipes
-        ]
-        self.defects = DefectFinder(calibration, shape, psf_index)
-        self.refractor = None
-        if refract and can_estimate_refraction(calibration):
-            self.refractor = RefractionEstimator(calibration, shape, planner, psf_index, field_fixed)
+        self._audience, self._consistency = audience, None if timed else consistency
+        with ThreadPoolExecutor(1, "planning") as aside:
+            refractor = None
+            if refract and can_estimate_refraction(calibration):
+                arguments = calibration, shape, planner, psf_index, field_fixed
+                refractor = aside.submit(RefractionEstimator, *arguments)
+            if timed and refractor is not None:
+                wait([refractor])  # the fastest transforms are measured one after the other
+            self.stages = [
+                _Stage(recipe, method_named(recipe.method, methods), calibration, shape, planner, psf_index)
+                for recipe in recipes
+            ]
+            self.defects = DefectFinder(calibration, shape, psf_index)
+        self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
         self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
         self._find_cost, self._refocus_cost = DurationEstimate(), DurationEstimate()
         self._cylinder_cost = DurationEstimate()
         self._gain = None if self.refractor is None else PsfGain(self.stages[-1].model)
-        self._consistency: PsfConsistency | None = None
-        self._audience = audience
-        self._warm_up(timed)
-        self._consistency = consistency  # noise needs no check
+        if timed:
+            self._warm_up()
+            self._consistency = consistency  # noise needs no check
 
-    def _warm_up(self, timed: bool) -> None:
-        """Run on noise to compile the kernels, touch the memory and, with `timed`, measure the cost of each step."""
+    def _warm_up(self) -> None:
+        """Run on noise to compile the kernels, touch the memory, and then measure the cost of each step."""
         noise = noise_frame(self.calibration, self.shape)
         self(noise, rounds=1)  # compiles, if the cache of compiled code is empty
-        if not timed:
-            return
         self(noise, np.zeros_like(noise), quick=True)  # a dark frame selects another compiled signature
         for stage in self.stages:
             stage.start_cost, stage.round_cost, stage.finish_cost = (
@@ -582,14 +587,9 @@ def without_sensor(calibration: Calibration) -> Calibration:
 def plane(image: Pixels, c: int) -> Pixels:
     """Return channel `c` of (rows, cols, 3), or a whole (rows, cols) image, as a contiguous read-only array.
 
-    uint16 is kept, any other type becomes float32; the caller's array stays writeable. Read-only is part of the type in
-    compiled code, and only the read-only signature is compiled in advance.
+    uint16 is kept, any other type becomes float32; the caller's array stays writeable.
     """
     image = image if image.ndim == 2 else image[..., c]
-    plane: Pixels
     if image.dtype == np.uint16:
-        plane = np.ascontiguousarray(image, np.uint16)[:]
-    else:
-        plane = np.ascontiguousarray(image, np.float32)[:]
-    plane.flags.writeable = False  # of this view, not of the caller's array
-    return plane
+        return read_only(np.ascontiguousarray(image, np.uint16))
+    return read_only(np.ascontiguousarray(image, np.float32))

@@ -56,6 +56,7 @@ ENDINGS = (".npy", ".tif", ".tiff", ".png")
 LEAST_SAMPLES = 16  # of the shorter side
 MOST_ROUNDS = 100_000
 MOST_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
+ONCE = "FFTW_ESTIMATE"  # plans of one picture: to measure them takes longer than the picture. Measured ones are used
 KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up to about 300 MB at full sensor size
 
 
@@ -107,7 +108,7 @@ def reconstruct_file(options: ReconstructOptions) -> FileReconstruction:
 
     `report` is not written here. Invalid options raise an error before any computation.
     """
-    reconstruct = FileReconstructor(options)
+    reconstruct = FileReconstructor(options, None if options.budget_s else Planner(options.plans, effort=ONCE))
     made = reconstruct(options.raw)
     if options.output is not None:
         write_picture(options.output, reconstruct.evened(made.picture), made.simulated)

@@ -14,6 +14,23 @@ from services.resources import fft_plans
 from tests.project_files import ROOT
 
 SOURCE = "def {name}(x):\n    return x + 1\n"
+ALLOCATING = """
+import numpy as np
+
+def doubled(x):
+    y = np.empty(x.size)
+    for i in range(x.size):
+        y[i] = 2 * x[i]
+    return y
+"""
+CACHED = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import numpy as np
+from device.recon.model.compiled import compiled
+from kernel import doubled
+print(compiled(doubled)(np.ones(3)).sum(), "numba.typed.typeddict" in sys.modules)
+"""
 FULL_DISK = """
 import resource, sys
 sys.path.insert(0, sys.argv[1])
@@ -44,6 +61,15 @@ def test_a_kernel_whose_cache_cannot_be_written_or_read_is_compiled(tmp_path: Pa
         assert "not cached" in done.stderr
         index = next((tmp_path / "cache").iterdir()) / "kernel.added-1.py311.nbi"
         index.touch()
+
+
+def test_a_cached_kernel_is_loaded_without_the_compiler(tmp_path: Path) -> None:
+    """A third of a second of every start; the kernel allocates, as Numba prepares its allocator with the compiler."""
+    (tmp_path / "kernel.py").write_text(ALLOCATING)
+    words = [sys.executable, "-c", CACHED, str(tmp_path)]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = [subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True) for _ in range(2)]
+    assert [one.stdout for one in done] == ["6.0 True\n", "6.0 False\n"], done[1].stderr
 
 
 @pytest.mark.parametrize(("kind", "side"), [("a file", 30), ("a folder", 34), ("no text", 38)])

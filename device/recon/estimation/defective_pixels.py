@@ -27,6 +27,7 @@ from scipy import ndimage
 
 from device.recon.estimation.shading import Shading
 from device.recon.model import kernels
+from device.recon.model.compiled import read_only
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.forward_model import tight_model
@@ -136,6 +137,7 @@ class DefectFinder:
         self._dark: Image = np.full((1, shape[1]), sensor.black_dn, np.float32)
         if calibration.dark_dn is not None and calibration.dark_dn.shape == shape:
             self._dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
+        self._dark = read_only(self._dark)
         gain, read_e = sensor.gain_e_per_dn, sensor.read_noise_e or 0.0
         self._least_noise = (
             PixelNoise(0.0, 0.0) if gain is None else PixelNoise(1 / gain, (read_e / gain) ** 2 + QUANTISATION_DN2)
@@ -155,7 +157,7 @@ class DefectFinder:
         calibration's bad mask are skipped by the outlier test only. FrameError for another shape than the
         calibration's.
         """
-        require_shape("frame", counts, self._shape)
+        counts = require_shape("frame", counts, self._shape)
         offset = self._dark if dark is None else require_shape("dark frame", np.asarray(dark, np.float32), self._shape)
         noise, found = self._least_noise, FEW + 1
         if noise.floor_dn2 > 0:
@@ -399,11 +401,12 @@ def ring_ranges(psf: Psf) -> tuple[float, float]:
     pixels = psf.pixels
     if min(pixels.shape) < 5:
         return float("inf"), float("inf")
-    zero_row = np.zeros((1, pixels.shape[1]), np.float32)
+    zero_row = read_only(np.zeros((1, pixels.shape[1]), np.float32))
     noise = PixelNoise.measured(pixels, zero_row)
-    least, limit = 0.1 * float(pixels.max()), PSF_NOISE_SD**2
+    least, limit = float(np.float32(0.1) * pixels.max()), PSF_NOISE_SD**2  # a float32: the count must be the kernel's
     no_mask = np.zeros(pixels.shape, np.bool_)
-    excess = kernels.ring_excess(pixels, zero_row, no_mask, least, limit * noise.per_dn, limit * noise.floor_dn2)
+    excess = np.zeros((np.count_nonzero(pixels[2:-2, 2:-2] >= least), 2))
+    kernels.ring_excess(pixels, zero_row, no_mask, least, limit * noise.per_dn, limit * noise.floor_dn2, excess)
     near, far = np.quantile(excess, RANGE_SHARE, axis=0, method="higher") if len(excess) else (0.0, 0.0)
     return float(near), float(far)
 
@@ -433,7 +436,7 @@ def _hot_pixels(pixels: Image) -> Places:
     places = np.flatnonzero((pixels > beside + np.float32(least)) & (pixels < CORE_SHARE))
     if not places.size:
         return none
-    zero_row, known = np.zeros((1, pixels.shape[1]), np.float32), np.zeros(pixels.shape, np.bool_)
+    zero_row, known = read_only(np.zeros((1, pixels.shape[1]), np.float32)), np.zeros(pixels.shape, np.bool_)
     noise = PixelNoise.measured(pixels, zero_row)
     is_hot, limit = np.zeros(places.size, np.bool_), NOISE_SD**2
     kernels.outliers(pixels, zero_row, known, places, limit * noise.per_dn, limit * noise.floor_dn2, HOT_RANGES, is_hot)

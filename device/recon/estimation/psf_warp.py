@@ -76,9 +76,10 @@ class InterpolatedOtf:
         half = scipy_fft.rfft(pixels, self.pixels, axis=1)[:, : last + 1]
         half *= np.exp(2j * np.pi * middle[1] / self.pixels * np.arange(last + 1)).astype(np.complex64)
         whole = scipy_fft.fft(half, self.pixels, axis=0)
-        table = np.concatenate([whole[-last:], whole[: last + 1]])
-        table *= np.exp(2j * np.pi * middle[0] / self.pixels * np.arange(-last, last + 1)).astype(np.complex64)[:, None]
-        return np.asarray(table / table[last, 0].real, np.complex64)
+        table: Spectrum = np.concatenate([whole[-last:], whole[: last + 1]])
+        centred = np.exp(2j * np.pi * middle[0] / self.pixels * np.arange(-last, last + 1)) / whole[0, 0].real
+        table *= centred.astype(np.complex64)[:, None]
+        return table
 
     def on_grid(self, shape: Pair, n: int, transform: Transform, out: Spectrum | None = None) -> Spectrum:
         """Return the OTF of the stretched PSF for n x n pixels on a torus of `shape` samples, complex64

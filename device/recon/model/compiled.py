@@ -11,11 +11,16 @@ from functools import cache
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache
+from numba.core.runtime.nrt import rtsys
 
 log = logging.getLogger(__name__)
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+Array = TypeVar("Array", bound=np.ndarray)
+# Versions of Numba whose cached code was tried without its compiler, whose tables take a third of a second to prepare.
+WITHOUT_COMPILER = "0.68."
 _njit = numba.njit(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
 _LOST = (OSError, EOFError, ValueError, pickle.UnpicklingError)  # of a disk that refuses, or of an incomplete file
 
@@ -25,8 +30,12 @@ class _OptionalCache(FunctionCache):
 
     def load_overload(self, sig: object, target_context: object) -> object:
         parent: Any = super()
+        load = parent.load_overload
+        if numba.__version__.startswith(WITHOUT_COMPILER):
+            rtsys.initialize(target_context)  # allocates the arrays of kernels, and is all that compiled code needs
+            load = parent._load_overload
         try:
-            return parent.load_overload(sig, target_context)
+            return load(sig, target_context)
         except _LOST as error:
             _report(f"{type(error).__name__}: {error}")
             return None
@@ -49,6 +58,16 @@ def compiled(function: Kernel) -> Kernel:
         _report("no folder for it can be written; NUMBA_CACHE_DIR may name one")
     kernel: Kernel = made
     return kernel
+
+
+def read_only(array: Array) -> Array:
+    """Return a read-only view of an array; data are not copied.
+
+    Read-only is part of an array's type in compiled code: a kernel would be compiled once for each kind.
+    """
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 @cache

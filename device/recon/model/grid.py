@@ -6,6 +6,7 @@ reaches the sensor wraps round; the grid is smaller than zero padding to twice t
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil, isfinite
 
 import numpy as np
@@ -119,6 +120,7 @@ def disc(shape: Pair, centre: tuple[float, float], radius_px: float) -> Image:
     return rim
 
 
+@lru_cache(maxsize=2)  # each holds its PSF
 def support_radius_px(psf: Psf) -> float:
     """Return the radius of the PSF's support in pixels: 1.05 times the radius that holds 99.7 % of its sum, plus 2.
 

@@ -52,13 +52,20 @@ def linearise(
         for a in range(first[0] + i * n, first[0] + i * n + n):
             begin, end = first[1], first[1] + wide
             if len(dark) > 1 or a == first[0]:  # a separate loop: inside the loop below it halves the speed
-                offset[:] = dark[a % len(dark)][begin:end]
+                _copy(dark[a % len(dark)][begin:end], offset)
             gain_row = gain[a % len(gain)][begin:end]
             saturated += _add_row(counts[a][begin:end], offset, gain_row, bend, np.float32(white_dn), total, used)
         row = _bin_row(total, used, n, out[i], good[i])
         good_pixels += row[0]
         light += row[1]
     return int(saturated), int(good_pixels), float(light)
+
+
+@compiled
+def _copy(source: Pixels, target: Image) -> None:
+    """Copy a row; the assignment to a slice would compile the text of its error for seconds."""
+    for j in range(target.size):
+        target[j] = source[j]
 
 
 @compiled
@@ -365,13 +372,13 @@ def mark_suspects(
     slope, floor, white, least = np.float32(slope_dn), np.float32(floor_dn2), np.float32(white_dn), np.float32(least_dn)
     above, here, below = np.zeros(cols, np.float32), np.zeros(cols, np.float32), np.zeros(cols, np.float32)
     _light(counts[0], dark[0], here)
-    above[:] = here
+    _copy(here, above)
     total = 0
     for i in range(rows):
         if i + 1 < rows:
             _light(counts[i + 1], dark[(i + 1) % len(dark)], below)
         else:
-            below[:] = here
+            _copy(here, below)
         _mark_row(counts[i], above, here, below, slope, floor, white, least, out[i])
         found = 0
         for j in range(cols):
@@ -424,6 +431,17 @@ def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, ou
 
 
 @compiled
+def _sort(values: Image, n: int) -> None:
+    """Sort the first `n` values in place, by insertion: np.sort takes a second to compile, and n is at most 16."""
+    for m in range(1, n):
+        value, k = values[m], m
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+
+
+@compiled
 def outliers(
     counts: Pixels,
     dark: Image,
@@ -451,9 +469,9 @@ def outliers(
         for k in range(2):
             n = _ring(counts, dark, known, i, j, k + 1, ring)
             if n > 2 * k + 4:
-                ordered = np.sort(ring[:n])
-                middle = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
-                spread = ordered[n - 2 - k] - ordered[1 + k]
+                _sort(ring, n)
+                middle = 0.5 * (ring[(n - 1) // 2] + ring[n // 2])
+                spread = ring[n - 2 - k] - ring[1 + k]
                 noise = np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
                 is_outlier[m] |= abs(light - middle) > noise + ranges[k] * spread
         found += is_outlier[m]
@@ -462,30 +480,25 @@ def outliers(
 
 @compiled
 def ring_excess(
-    image: Image, zero_row: Image, no_mask: Mask, least: float, slope_dn: float, floor_dn2: float
-) -> Series:
-    """Return for each pixel of at least `least` the smallest pair `ranges` with which `outliers` does not mark it.
+    image: Image, zero_row: Image, no_mask: Mask, least: float, slope_dn: float, floor_dn2: float, out: Series
+) -> None:
+    """Write for each pixel of at least `least` the smallest pair `ranges` with which `outliers` does not mark it.
 
-    The result is (pixels, 2). The two outermost rows and columns are left out. `zero_row` is a row of zeros, `no_mask`
-    a mask (rows, cols) of False.
+    `out` is (pixels, 2), of zeros. The two outermost rows and columns are left out. `zero_row` is a row of zeros,
+    `no_mask` a mask (rows, cols) of False.
     """
     rows, cols = image.shape
-    ring, total = np.empty(16, np.float32), 0
-    for i in range(2, rows - 2):
-        for j in range(2, cols - 2):
-            total += image[i, j] >= least
-    found, at = np.zeros((total, 2), np.float64), 0
+    ring, at = np.empty(16, np.float32), 0
     for i in range(2, rows - 2):
         for j in range(2, cols - 2):
             if image[i, j] < least:
                 continue
             for k in range(2):
                 n = _ring(image, zero_row, no_mask, i, j, k + 1, ring)
-                known = np.sort(ring[:n])
-                middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
-                spread = known[n - 2 - k] - known[1 + k]
+                _sort(ring, n)
+                middle = 0.5 * (ring[(n - 1) // 2] + ring[n // 2])
+                spread = ring[n - 2 - k] - ring[1 + k]
                 excess = abs(image[i, j] - middle) - np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
                 if excess > 0:
-                    found[at, k] = excess / max(spread, np.float32(1e-30))
+                    out[at, k] = excess / max(spread, np.float32(1e-30))
             at += 1
-    return found

@@ -6,6 +6,7 @@ import numpy as np
 
 from device.errors import FrameError
 from device.recon.model import kernels
+from device.recon.model.compiled import read_only
 from device.recon.model.grid import Grid
 from device.recon.model.kernels import Pixels, Places
 from device.values import Calibration, Image
@@ -60,6 +61,7 @@ class Preprocessor:
             self.dark[~np.isfinite(self.dark)] = 0
         if calibration.bad is not None:
             self.gain[require_shape("bad-pixel mask", calibration.bad, shape)] = 0
+        self.dark = read_only(self.dark)
         missing = float((self.gain == 0).mean())
         if missing > MOST_BAD:
             raise FrameError(
@@ -78,7 +80,7 @@ class Preprocessor:
         (flat indices) count as missing. The next call overwrites the buffers of the result. FrameError for another
         shape, or if more than MOST_BAD of the pixels are missing.
         """
-        require_shape("frame", counts, self.grid.sensor)
+        counts = require_shape("frame", counts, self.grid.sensor)
         offset = self.dark if dark is None else require_shape("dark frame", dark, self.grid.sensor)
         y, good, grid = self._out.y, self._out.good, self.grid
         first, n = grid.first_px, grid.n
@@ -100,10 +102,10 @@ class Preprocessor:
 
 
 def require_shape(name: str, array: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the array itself; FrameError with `name` if its shape is not `shape` (compiled code checks no bounds)."""
+    """Return the array, read-only; FrameError with `name` for another shape, as compiled code checks no bounds."""
     if array.shape != shape:
         raise FrameError(
             f"the {name} has {' x '.join(map(str, array.shape))} pixels, this head {shape[0]} x {shape[1]}",
             "Use files of one and the same camera mode.",
         )
-    return array
+    return read_only(array)
