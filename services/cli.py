@@ -4,54 +4,61 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
+from typer.core import TyperGroup
 
 from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import DiffuscopeError, SettingError
-from device.head import probe, recording_spec
-from device.recon.installed_methods import available_methods
-from device.recon.methods import DEFAULT
-from device.recon.model.grid import Grid
 from device.values import Colour
 from services import resources
-from services.archive import command as archive_command
-from services.backup import command as backup_command
-from services.records.command import app as snapshots
-from services.records.store_command import app as store
 from services.research.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
-from services.research.datasets import open_dataset
-from services.research.montage_files import montage_files, placed_lines
 from services.research.named_files import head_file, scene_file
 from services.research.peers import ENVIRONMENT, installed_peer
-from services.research.psf_stack import psf_stack
-from services.research.reconstruct_burst import reconstruct_burst, reconstruct_colours
-from services.research.reconstruct_each import reconstruct_each
-from services.research.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
-from services.research.reconstruct_inputs import ReconstructOptions
-from services.running_time import working
-from services.update.command import app as update_app
-from services.workshop import calibration_archive
+
+if TYPE_CHECKING:
+    from services.research.reconstruct_burst import ChannelSource
+    from services.research.reconstruct_file import FileReconstruction
+    from services.research.reconstruct_inputs import ReconstructOptions
+
+GROUPS = {
+    "calibrations": "services.workshop.calibration_archive",
+    "update": "services.update.command",
+    "snapshots": "services.records.command",
+    "store": "services.backup.command",
+    "archive": "services.archive.command",
+}
+
+
+class Commands(TyperGroup):
+    """All commands; the module of a group of GROUPS is imported when the group is used or its help is shown."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands, groups last."""
+        return [*super().list_commands(ctx), *GROUPS]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command or a group; None for an unknown name."""
+        if cmd_name not in GROUPS:
+            return super().get_command(ctx, cmd_name)
+        group = typer.main.get_group(import_module(GROUPS[cmd_name]).app)
+        group.name = cmd_name
+        return group
+
 
 app = typer.Typer(
     name="diffuscope",
+    cls=Commands,
     help="A funduscope whose lens is a piece of diffuser.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(calibration_archive.app, name="calibrations")
-
-app.add_typer(update_app, name="update")
-app.add_typer(snapshots, name="snapshots")
-app.add_typer(store, name="store")
-store.command()(backup_command.backup)
-store.command()(backup_command.restore)
-app.add_typer(archive_command.app, name="archive")
 
 INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography", "pyrage"})
 ARCHIVE_PACKAGES = frozenset({"distributed", "dask", "pyarrow"})
@@ -119,6 +126,9 @@ def run(
 
 def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs: tuple[Path, ...]) -> InstrumentSpec:
     if replay is not None or raws or psfs:
+        from device.head import recording_spec
+        from services.research.psf_stack import psf_stack
+
         if head is not None:
             raise typer.BadParameter("choose --head or a recording (--replay, --raw with --psf), not both")
         stack = tuple(one for one in psf_stack(psfs) if isinstance(one, Path))
@@ -187,6 +197,11 @@ def reconstruct(
 
     With --each one picture of every frame of a recording; with --channel one colour picture.
     """
+    from services.research.psf_stack import psf_stack
+    from services.research.reconstruct_file import parse_bayer, parse_settings, write_or_raise
+    from services.research.reconstruct_inputs import ReconstructOptions
+    from services.running_time import working
+
     channels, raws = parse_channels(channel or [], calibration is not None), raw or []
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
@@ -214,17 +229,28 @@ def reconstruct(
     refuse_mixed(raws, channels, darks, each)
     with working("reconstructing", _progress, SystemClock()) as beat:
         if each:
+            from services.research.reconstruct_each import reconstruct_each
+
             failed = reconstruct_each(raws, options, output, report, typer.echo, _progress)
             raise typer.Exit(1 if failed else 0)
-        if channels:
-            made = reconstruct_colours(channels, options, darks)
-        else:
-            made = reconstruct_file(options) if len(raws) == 1 else reconstruct_burst(raws, options)
+        made = _reconstructed(raws, channels, darks, options)
     if report is not None:
         write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
     typer.echo(f"{output}: {made.summary}; {beat.spent}")
     for warning in made.report.warnings:
         typer.echo(f"note: {warning}", err=True)
+
+
+def _reconstructed(
+    raws: list[Path], channels: "list[ChannelSource]", darks: dict[str, Path], options: "ReconstructOptions"
+) -> "FileReconstruction":
+    if len(raws) == 1 and not channels:
+        from services.research.reconstruct_file import reconstruct_file
+
+        return reconstruct_file(options)
+    from services.research.reconstruct_burst import reconstruct_burst, reconstruct_colours
+
+    return reconstruct_colours(channels, options, darks) if channels else reconstruct_burst(raws, options)
 
 
 @app.command()
@@ -240,6 +266,8 @@ def montage(
 
     Without a head file their scale in degrees is unknown, and they are joined on the plane; the report says so.
     """
+    from services.research.montage_files import montage_files, placed_lines
+
     joined = montage_files(picture, output, report, _progress, head and head_file(head))
     rows, cols = joined.picture.shape[:2]
     used = sum(one.used for one in joined.placed)
@@ -273,6 +301,8 @@ def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardw
     The lamp shines, and its light is not counted for an eye: point the head at white paper. The exit status is 1 if a
     part is not well.
     """
+    from device.head import probe
+
     well = True
     for found in probe(load_head(head), SystemClock()):
         well &= found.ok
@@ -537,6 +567,7 @@ def draw_chart(
 ) -> None:
     """Draw the retina chart of the model eye, to print at 100 % and cut out: hardware/model-eye.md."""
     from device.optics.retina_chart import chart_svg
+    from services.research.reconstruct_file import write_or_raise
 
     write_or_raise(output, lambda: output.write_text(chart_svg(), encoding="utf-8"))
     typer.echo(f"{output}: print at 100 %; the line below the chart is 20 mm long")
@@ -559,6 +590,7 @@ def simulate(
     Only the effects that the scene calls for are simulated; the plan says for each which number decided.
     """
     from services.research import simulate_scene  # imports the simulator only for this command
+    from services.running_time import working
 
     spec = load_head(scene_file(scene))
     selected = simulate_scene.SelectedEffects(everything, tuple(only or ()), tuple(without or ()))
@@ -630,6 +662,7 @@ def show_data_set(
 ) -> None:
     """Say what a folder of lensless recordings holds: layout, pairs, sizes, PSFs, orientation."""
     from services.research import dataset_summary
+    from services.research.datasets import open_dataset
 
     dataset = open_dataset(folder, psf, "all" if every else "test")
     typer.echo(dataset_summary.summary(dataset))
@@ -658,6 +691,7 @@ def bench_data_set(
     The exit status is 1 if a pair, or a method on a pair, was left out.
     """
     from services.research import benchmark  # imports the simulator only for this command
+    from services.research.datasets import open_dataset
     from services.research.pair_scores import table
 
     request = benchmark.BenchmarkRequest(
@@ -716,6 +750,8 @@ def optics(
     ] = False,
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
+    from services.research.reconstruct_file import write_or_raise
+    from services.running_time import working
     from services.workshop import head_search, light_path_plot, light_report
     from services.workshop import optics_report as budget
 
@@ -747,6 +783,10 @@ def methods(
     cols: Annotated[int, typer.Option(min=1, help="Columns of the frame.")] = 1920,
 ) -> None:
     """List the solvers with their cost in FFT pairs and their memory for a frame size."""
+    from device.recon.installed_methods import available_methods
+    from device.recon.methods import DEFAULT
+    from device.recon.model.grid import Grid
+
     found = available_methods().values()  # before the first line is printed: a plug-in may be wrong
     typer.echo(f"{'method':<12} {'FFT pairs':>9} {'memory':>8}   for {rows} x {cols}")
     for method in found:

@@ -34,6 +34,7 @@ from services.update.command import app as update_app
 from services.update.ipc import REQUEST_FILE, TABLET
 from services.update.settings import UpdateSettings
 from services.update.settings import load_settings as load_settings
+from tests.golden.command_line import subcommands
 from tests.hard.__main__ import app as hard
 from tests.paper.__main__ import app as paper
 from tests.project_files import BIN, ROOT, TOP_FOLDERS, Violation, check_rule, files, nodes, python_files, text
@@ -191,16 +192,12 @@ def code_in(markdown: str) -> list[str]:
 @cache
 def commands() -> dict[str, set[str]]:
     """Return the commands of `diffuscope`, subcommands included, each with its options."""
-    group = typer.main.get_group(app)
-    group.commands |= {"paper": typer.main.get_command(paper), "hard": typer.main.get_command(hard)}
-    inner = [
-        (f"{name} {second}", command)
-        for name, outer in group.commands.items()
-        for second, command in getattr(outer, "commands", {}).items()
-    ]
+    outer = dict(subcommands(typer.main.get_group(app)))
+    outer |= {"paper": typer.main.get_command(paper), "hard": typer.main.get_command(hard)}
+    inner = [(f"{name} {second}", command) for name, one in outer.items() for second, command in subcommands(one)]
     return {
         name: {"--help"}.union(*(p.opts + p.secondary_opts for p in command.params))
-        for name, command in [*group.commands.items(), *inner]
+        for name, command in [*outer.items(), *inner]
     }
 
 

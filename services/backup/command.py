@@ -10,7 +10,7 @@ import typer
 from device.clock import SystemClock
 from device.errors import SpecError
 from device.user_files import read_text
-from services.records.store_command import Data, table
+from services.records.store_command import Data, app, table
 
 if TYPE_CHECKING:
     from services.backup.backup_key import BackupHeader, BackupKey, SecretKey
@@ -20,6 +20,7 @@ PassphraseFile = Annotated[
 ]
 
 
+@app.command()
 def backup(
     to: Annotated[Path, typer.Option(help="USB stick or folder that gets the folder of the backups.")],
     data: Data,
@@ -52,6 +53,7 @@ def backup(
         sys.exit(1)
 
 
+@app.command()
 def restore(
     source: Annotated[Path, typer.Option("--from", help="Folder of the backups, or the stick that has it.")],
     data: Data,

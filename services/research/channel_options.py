@@ -6,13 +6,15 @@ With `--calibration` it is `--channel NAME RAW`.
 from collections.abc import Collection, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from typer.core import TyperCommand
 
 from device.errors import SettingError
 from device.recon.colour import CHANNELS
-from services.research.reconstruct_burst import ChannelSource
+
+if TYPE_CHECKING:
+    from services.research.reconstruct_burst import ChannelSource
 
 SEPARATOR = "\0"  # no path holds it
 CHANNEL_REMEDY = "Give --channel NAME RAW PSF, as in --channel green raw.npy psf.npy."
@@ -65,11 +67,13 @@ def _joined(args: Sequence[str]) -> list[str]:
     return joined
 
 
-def parse_channels(words: Sequence[str], stored: bool) -> list[ChannelSource]:
+def parse_channels(words: Sequence[str], stored: bool) -> "list[ChannelSource]":
     """Return the values of `--channel`, in their order; SettingError for an unknown name or too few values.
 
     `stored`: the PSFs are those of a stored calibration, and a channel has a name and a raw.
     """
+    from services.research.reconstruct_burst import ChannelSource  # deferred: few commands have channels
+
     found = []
     for word in words:
         values = word.split(SEPARATOR)
@@ -103,7 +107,7 @@ def parse_darks(words: Sequence[str]) -> tuple[Path | None, dict[str, Path]]:
 
 
 def refuse_mixed(
-    raws: Sequence[Path], channels: Sequence[ChannelSource], darks: Mapping[str, Path], each: bool
+    raws: Sequence[Path], channels: "Sequence[ChannelSource]", darks: Mapping[str, Path], each: bool
 ) -> None:
     """Raise SettingError for raws together with channels, for neither, or for channels with --each."""
     if channels and (raws or each):

@@ -13,6 +13,7 @@ import typer
 from playwright.sync_api import Browser, Request, sync_playwright
 
 from services.cli import app
+from tests.golden.command_line import subcommands
 from tests.project_files import ROOT, files
 
 pytestmark = pytest.mark.site
@@ -132,5 +133,5 @@ def test_every_script_of_the_gallery_has_pictures_and_a_notebook() -> None:
 def test_the_reference_has_every_public_name_and_every_command() -> None:
     described = page(SITE / "python_api.html").ids
     assert {f"diffuscope.{name}" for name in diffuscope.__all__ if not name.startswith("__")} <= described
-    commands = {command.replace("_", "-") for command in typer.main.get_group(app).commands}
+    commands = {name for name, _ in subcommands(typer.main.get_group(app))}
     assert {f"diffuscope-{command}" for command in commands} <= page(SITE / "command_line.html").ids

@@ -205,10 +205,18 @@ def commands() -> Iterator[list[str]]:
 
     def below(command: Any, words: list[str]) -> Iterator[list[str]]:
         yield words
-        for name, inner in getattr(command, "commands", {}).items():
+        for name, inner in subcommands(command):
             yield from below(inner, [*words, name])
 
     yield from below(typer.main.get_command(app), [])
+
+
+def subcommands(command: Any) -> list[tuple[str, Any]]:
+    """Return the commands of a group by their names; none for a single command."""
+    if not hasattr(command, "list_commands"):
+        return []
+    context = command.make_context("diffuscope", [], resilient_parsing=True)
+    return [(name, command.get_command(context, name)) for name in command.list_commands(context)]
 
 
 def called(words: list[str]) -> dict[str, Any]:

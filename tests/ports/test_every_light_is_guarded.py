@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from device.calibration.archive import Archive
 from services.cli import app
+from tests.golden.command_line import subcommands
 from tests.ports.conftest import HEAD
 from tests.ports.emulators.wires import emulated_buses
 from tests.project_files import nodes, python_files, text
@@ -126,8 +127,8 @@ def command_names() -> set[str]:
     """Return every command of the command line by its words."""
 
     def below(group: Any, words: str) -> Iterator[str]:
-        for name, one in group.commands.items():
-            if hasattr(one, "commands"):
+        for name, one in subcommands(group):
+            if subcommands(one):
                 yield from below(one, f"{words}{name} ")
             else:
                 yield f"{words}{name}"

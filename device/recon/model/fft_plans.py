@@ -8,6 +8,7 @@ import json
 import logging
 import platform
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import pyfftw
@@ -67,14 +68,14 @@ class Planner:
     the mean.
 
     Wisdom is valid for one processor and one build of FFTW; the file name is a hash of both. `folder` None keeps none.
-    `effort` is an FFTW planner flag. SettingError for fewer than one thread.
+    `effort` is an FFTW planner flag. Several threads may plan at once. SettingError for fewer than one thread.
     """
 
     def __init__(self, folder: Path | None, threads: int = 1, effort: str = "FFTW_MEASURE") -> None:
         if threads < 1:
             raise SettingError(f"{threads} threads cannot plan anything")
         self.threads, self.effort, self.folder = threads, effort, folder
-        self.planned = 0
+        self.planned, self._lock = 0, Lock()
         if folder is not None:
             self._import_wisdom(self._file(folder))
 
@@ -105,13 +106,14 @@ class Planner:
 
     def plan(self, shape: tuple[int, int]) -> RealFft:
         """Return a new plan for one shape; write new wisdom to the folder, if set (a failure is only logged)."""
-        known = pyfftw.export_wisdom()
-        fft = RealFft(shape, self.threads, self.effort)
-        self.planned += 1
-        wisdom = pyfftw.export_wisdom()
-        if self.folder is not None and wisdom != known:
-            self._write_wisdom(wisdom, self._file(self.folder))
-        return fft
+        with self._lock:
+            known = pyfftw.export_wisdom()
+            fft = RealFft(shape, self.threads, self.effort)
+            self.planned += 1
+            wisdom = pyfftw.export_wisdom()
+            if self.folder is not None and wisdom != known:
+                self._write_wisdom(wisdom, self._file(self.folder))
+            return fft
 
 
 def processor_name() -> str:
