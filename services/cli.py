@@ -20,6 +20,7 @@ from services import resources
 from services.research.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.research.named_files import head_file, scene_file
 from services.research.peers import ENVIRONMENT, installed_peer
+from services.running_time import announced, say, working
 
 if TYPE_CHECKING:
     from services.research.reconstruct_burst import ChannelSource
@@ -200,7 +201,6 @@ def reconstruct(
     from services.research.psf_stack import psf_stack
     from services.research.reconstruct_file import parse_bayer, parse_settings, write_or_raise
     from services.research.reconstruct_inputs import ReconstructOptions
-    from services.running_time import working
 
     channels, raws = parse_channels(channel or [], calibration is not None), raw or []
     common_dark, darks = parse_darks(dark or [])
@@ -227,11 +227,11 @@ def reconstruct(
         not no_refraction,
     )
     refuse_mixed(raws, channels, darks, each)
-    with working("reconstructing", _progress, SystemClock()) as beat:
+    with working("reconstructing") as beat:
         if each:
             from services.research.reconstruct_each import reconstruct_each
 
-            failed = reconstruct_each(raws, options, output, report, typer.echo, _progress)
+            failed = reconstruct_each(raws, options, output, report, typer.echo, say)
             raise typer.Exit(1 if failed else 0)
         made = _reconstructed(raws, channels, darks, options)
     if report is not None:
@@ -254,6 +254,7 @@ def _reconstructed(
 
 
 @app.command()
+@announced("joining pictures")
 def montage(
     picture: Annotated[list[Path], typer.Argument(help="Pictures of one eye in several gaze directions.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
@@ -268,19 +269,16 @@ def montage(
     """
     from services.research.montage_files import montage_files, placed_lines
 
-    joined = montage_files(picture, output, report, _progress, head and head_file(head))
+    joined = montage_files(picture, output, report, say, head and head_file(head))
     rows, cols = joined.picture.shape[:2]
     used = sum(one.used for one in joined.placed)
     typer.echo(f"{output}: {used} of {len(picture)} pictures on the {joined.projection}, {rows} x {cols} pixels")
     for line in placed_lines(joined, picture):
-        _progress(line)
-
-
-def _progress(line: str) -> None:
-    typer.echo(line, err=True)
+        say(line)
 
 
 @app.command()
+@announced("asking the instrument")
 def health(
     at: Annotated[str, typer.Option(help="Address of the running instrument.")] = "http://127.0.0.1:8000",
     look: Annotated[bool, typer.Option("--look", help="Also take a live picture, which shines for a moment.")] = False,
@@ -295,6 +293,7 @@ def health(
 
 
 @app.command("probe")
+@announced("probing the head")
 def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")]) -> None:
     """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips.
 
@@ -313,6 +312,7 @@ def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardw
 
 
 @app.command("doctor")
+@announced("examining the computer")
 def examine_computer(
     head: Annotated[Path | None, typer.Option(help="Head file; its parts are opened, without light.")] = None,
     leds: Annotated[bool, typer.Option("--leds", help="Also light each LED: point the head at white paper.")] = False,
@@ -331,6 +331,7 @@ def examine_computer(
 
 
 @app.command("frame")
+@announced("exposing")
 def take_frame(
     head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/bench.toml.")],
     output: Annotated[Path, typer.Option("-o", help="Raw frame to write, .tiff.")],
@@ -369,7 +370,7 @@ def light_for_meter(
     run = power_meter.run_of(spec, level, seconds)
     typer.echo(power_meter.announcement(run))
     typer.confirm("A power meter stands behind the hole on the axis, and no person looks in?", abort=True)
-    power_meter.give_pulses(run, data or _default_data(), SystemClock(), _progress)
+    power_meter.give_pulses(run, data or _default_data(), SystemClock(), say)
     shown_uw = typer.prompt("Reading in uW", type=float)
     verdict = power_meter.judge_reading(run, shown_uw, peak=peak)
     typer.echo(power_meter.words(head, run, verdict))
@@ -377,6 +378,7 @@ def light_for_meter(
 
 
 @app.command("light")
+@announced("judging the light")
 def judge_light(
     head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
     axis_uw: Annotated[float, typer.Option(min=0, help="Power behind the hole on the axis, as diffuscope meter asks.")],
@@ -467,7 +469,7 @@ def show_trial_lenses(
     from services.workshop.check_head import with_archive
     from services.workshop.trial_lens_check import calibrate_with_lenses
 
-    _progress("the lamp shines for moments: a trainer eye stands before the head, and no person")
+    say("the lamp shines for moments: a trainer eye stands before the head, and no person")
     spec, bench = with_archive(load_head(head), archive), LensBench(vertex_mm, PowerVector(eye_dpt))
     done = calibrate_with_lenses(spec, bench, SystemClock(), _ask_operator, typer.echo)
     typer.echo(f"{done.stored.calibration.id} is in force; reports subtract its offset")
@@ -486,7 +488,7 @@ def show_white_card(
     from services.workshop.check_head import with_archive
     from services.workshop.white_card_check import measure_white_card
 
-    _progress("the lamp shines for moments: a white card stands before the head, and no person")
+    say("the lamp shines for moments: a white card stands before the head, and no person")
     stored = measure_white_card(with_archive(load_head(head), archive), SystemClock(), _ask_operator, typer.echo)
     typer.echo(next(line for line in details(stored) if "white card" in line))
     typer.echo(f"{stored.calibration.id} is in force; colour pictures are balanced by it")
@@ -501,6 +503,7 @@ def _colours(words: str) -> tuple[Colour, ...]:
 
 
 @app.command("check")
+@announced("checking the head")
 def check_head(
     head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
     archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
@@ -534,7 +537,7 @@ def check_head(
     spec = with_archive(load_head(head), archive)
     if spec.calibration is None:
         raise typer.BadParameter("the head file names no archive of calibrations; give one with --archive")
-    found = check_calibration(spec, data or _default_data(), SystemClock(), lambda line: typer.echo(line, err=True))
+    found = check_calibration(spec, data or _default_data(), SystemClock(), say)
     typer.echo(f"calibration {found.kept.calibration.id} of {found.kept.provenance.serial}")
     typer.echo(table(found))
     raise typer.Exit(1 if any(one.fails for one in found.findings) else 0)
@@ -554,7 +557,7 @@ def _check_model_eye(
     if raw is not None and psf is not None:
         frame = model_eye.ModelEyeFrame(raw, psf, dark, exposure_s or spec.camera.exposure_s)
     else:
-        _progress("the lamp shines for a moment: the model eye stands before the head, and no person")
+        say("the lamp shines for a moment: the model eye stands before the head, and no person")
         frame = model_eye.expose_model_eye(spec, exposure_s, SystemClock())
     found = model_eye.check_model_eye(head, frame)
     typer.echo(model_eye.as_json(found) if as_json else model_eye.table(found))
@@ -562,6 +565,7 @@ def _check_model_eye(
 
 
 @app.command("chart")
+@announced("drawing the chart")
 def draw_chart(
     output: Annotated[Path, typer.Option("--output", "-o", help="Where to draw the chart, as SVG.")],
 ) -> None:
@@ -590,13 +594,12 @@ def simulate(
     Only the effects that the scene calls for are simulated; the plan says for each which number decided.
     """
     from services.research import simulate_scene  # imports the simulator only for this command
-    from services.running_time import working
 
     spec = load_head(scene_file(scene))
     selected = simulate_scene.SelectedEffects(everything, tuple(only or ()), tuple(without or ()))
     if output is None and not explain:
         raise typer.BadParameter("give -o FOLDER to write into, or --explain to see the plan only")
-    with working(f"simulating {spec.name}", _progress, SystemClock()):
+    with working(f"simulating {spec.name}"):
         if output is None or explain:
             typer.echo(simulate_scene.explain_plan(spec, selected))
             return
@@ -643,15 +646,16 @@ def frontier(
         tuple(method or ()),
     )
     wanted = None if data is None else frontier_pairs.dataset_request(request, data, limit)
-    with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:
+    with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, say) as peer:
         if wanted is None:
-            typer.echo(measured.table(measured.frontier(request, _progress, peer)))
+            typer.echo(measured.table(measured.frontier(request, say, peer)))
         else:
-            typer.echo(frontier_pairs.dataset_table(frontier_pairs.frontier_of_dataset(wanted, peer, _progress)))
+            typer.echo(frontier_pairs.dataset_table(frontier_pairs.frontier_of_dataset(wanted, peer, say)))
     typer.echo(f"{json_file}, {plot}")
 
 
 @app.command("data")
+@announced("reading the data set")
 def show_data_set(
     folder: DataSet,
     psf: OwnPsf = None,
@@ -668,7 +672,7 @@ def show_data_set(
     typer.echo(dataset_summary.summary(dataset))
     if not check:
         return
-    problems = dataset_summary.check(dataset, SystemClock(), _progress)
+    problems = dataset_summary.check(dataset, SystemClock(), say)
     for problem in problems:
         typer.echo(f"FAIL  {problem.pair}: {problem.reason}")
     typer.echo(f"{len(dataset) - len(problems)} of {len(dataset)} pairs can be read")
@@ -697,8 +701,8 @@ def bench_data_set(
     request = benchmark.BenchmarkRequest(
         open_dataset(folder, psf), limit, tuple(method or ()), repeats, json_file, resources.fft_plans()
     )
-    with installed_peer(None if no_peers else peers, benchmark.LENSLESS_ROUNDS, _progress) as peer:
-        found = benchmark.benchmark(request, peer, SystemClock(), _progress)
+    with installed_peer(None if no_peers else peers, benchmark.LENSLESS_ROUNDS, say) as peer:
+        found = benchmark.benchmark(request, peer, SystemClock(), say)
     typer.echo(table(found.rows))
     for one in found.left_out:
         typer.echo(f"left out: {one}")
@@ -734,6 +738,7 @@ def hard(context: typer.Context) -> None:
 
 
 @app.command()
+@announced("computing")
 def optics(
     head: Annotated[Path | None, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")] = None,
     sensor: Annotated[str | None, typer.Option(help="A file of device/config/sensor_presets/, such as imx296.")] = None,
@@ -751,7 +756,6 @@ def optics(
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
     from services.research.reconstruct_file import write_or_raise
-    from services.running_time import working
     from services.workshop import head_search, light_path_plot, light_report
     from services.workshop import optics_report as budget
 
@@ -763,10 +767,8 @@ def optics(
         typer.echo(budget.comparison())
         return
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
-    with working("searching" if search else "computing", _progress, SystemClock()):
-        report = head_search.table if search else budget.table
-        found = light_report.table(chosen, frames) if light and not search else report(chosen)
-    typer.echo(found)
+    report = head_search.table if search else budget.table
+    typer.echo(light_report.table(chosen, frames) if light and not search else report(chosen))
     if light_svg is not None:
         write_or_raise(
             light_svg, lambda: light_svg.write_text(light_report.gains_svg(chosen, frames), encoding="utf-8")
@@ -778,6 +780,7 @@ def optics(
 
 
 @app.command()
+@announced("listing the methods")
 def methods(
     rows: Annotated[int, typer.Option(min=1, help="Rows of the frame.")] = 1080,
     cols: Annotated[int, typer.Option(min=1, help="Columns of the frame.")] = 1920,

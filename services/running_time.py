@@ -2,17 +2,22 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from threading import Event, Thread
+from typing import ParamSpec, TypeVar
 
-from numba.core import event
+import typer
 
-from device.clock import Clock
+from device.clock import Clock, SystemClock
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 FIRST_S, NEXT_S, LATER_S = 1.0, 3.0, 10.0  # after the start; then every LATER_S
 COMPILING = "compiling kernels, which this computer then keeps"
 
 
-class RunningTime(event.Listener):
+class RunningTime:
     """Durations of a computation in seconds: of all of it, and of the compilation of kernels within it."""
 
     def __init__(self, clock: Clock) -> None:
@@ -31,31 +36,66 @@ class RunningTime(event.Listener):
         compiled = f", {self.compiled_s:.1f} s of them to compile kernels, once on this computer"
         return f"{self.seconds:.1f} s in all{compiled if self.compiles else ''}"
 
-    def on_start(self, _: object) -> None:
+    def begin_kernel(self) -> None:
         """Note that a kernel begins to be compiled; one may need another."""
         if self._depth == 0:
             self._compile_begin_s = self._clock.now_s()
         self._depth, self.compiles = self._depth + 1, True
 
-    def on_end(self, _: object) -> None:
+    def end_kernel(self) -> None:
         """Note that a kernel is compiled."""
         self._depth -= 1
         if self._depth == 0:
             self.compiled_s += self._clock.now_s() - self._compile_begin_s
 
 
+def announced(doing: str) -> Callable[[Callable[Given, Result]], Callable[Given, Result]]:
+    """Return a decorator of a command that asks nothing: `doing` and its duration go to stderr while it runs."""
+
+    def decorate(command: Callable[Given, Result]) -> Callable[Given, Result]:
+        @wraps(command)
+        def run(*args: Given.args, **kwargs: Given.kwargs) -> Result:
+            with announcing(doing):
+                return command(*args, **kwargs)
+
+        vars(run)["announced"] = doing
+        return run
+
+    return decorate
+
+
+def say(line: str) -> None:
+    """Print a line to stderr."""
+    typer.echo(line, err=True)
+
+
 @contextmanager
-def working(doing: str, progress: Callable[[str], None], clock: Clock) -> Iterator[RunningTime]:
-    """Call `progress` with `doing` and its duration, from FIRST_S on, until the end of the computation."""
-    beat, ended = RunningTime(clock), Event()
+def working(doing: str, progress: Callable[[str], None] = say, clock: Clock | None = None) -> Iterator[RunningTime]:
+    """Call `progress` with `doing` and its duration, from FIRST_S on, until the end of a computation with kernels."""
+    from numba.core import event  # not for commands without kernels: it takes a third of a second
+
+    class Kernels(event.Listener):
+        def on_start(self, _: object) -> None:
+            beat.begin_kernel()
+
+        def on_end(self, _: object) -> None:
+            beat.end_kernel()
+
+    with announcing(doing, progress, clock) as beat, event.install_listener("numba:compile", Kernels()):
+        yield beat
+
+
+@contextmanager
+def announcing(doing: str, progress: Callable[[str], None] = say, clock: Clock | None = None) -> Iterator[RunningTime]:
+    """Call `progress` with `doing` and its duration, from FIRST_S on, until the end; kernels are not looked at."""
+    beat, ended = RunningTime(clock or SystemClock()), Event()
     thread = Thread(target=_report, args=(doing, progress, beat, ended), name="progress", daemon=True)
-    with event.install_listener("numba:compile", beat):
-        thread.start()
-        try:
-            yield beat
-        finally:
-            ended.set()
-            thread.join()
+    thread.start()
+    try:
+        yield beat
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _report(doing: str, progress: Callable[[str], None], beat: RunningTime, ended: Event) -> None:

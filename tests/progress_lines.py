@@ -2,7 +2,7 @@
 
 import re
 
-PROGRESS = re.compile(r"^(?:reconstructing|searching|computing|simulating .*): \d+ s(?: \(compiling .*\))?\n", re.M)
+PROGRESS = re.compile(r"^\w+ing\b[^:\n]*: \d+ s(?: \(compiling .*\))?\n", re.M)
 COMPILED = re.compile(r", \d+\.\d s of them to compile kernels, once on this computer")
 
 

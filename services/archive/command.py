@@ -8,15 +8,13 @@ import typer
 from device.clock import SystemClock
 from services.archive.plan import PlanSettings, read_plan, write_plan
 from services.research.reconstruct_file import require_writable
+from services.running_time import announced, say
 
 app = typer.Typer(help="Reprocess an archive of raw frames: plan, run, report, adopt.", no_args_is_help=True)
 
 
-def _progress(line: str) -> None:
-    typer.echo(line, err=True)
-
-
 @app.command()
+@announced("planning")
 def plan(
     source: Annotated[list[Path], typer.Argument(help="A store, exports, or a folder with raw frames and psf.tiff.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Where to write the plan, as TOML.")],
@@ -29,17 +27,18 @@ def plan(
 
     require_writable(output)
     settings = PlanSettings(method=method, rounds=rounds, budget_s=budget_s)
-    made = make_plan(source, settings, SystemClock(), _progress)
+    made = make_plan(source, settings, SystemClock(), say)
     write_plan(made, output)
     for one in made.left_out[:20]:
-        _progress(f"left out: {one.id}: {one.reason}")
+        say(f"left out: {one.id}: {one.reason}")
     if len(made.left_out) > 20:
-        _progress(f"and {len(made.left_out) - 20} more, which the plan lists")
+        say(f"and {len(made.left_out) - 20} more, which the plan lists")
     counts = f"{len(made.captures)} captures with {len(made.calibrations)} calibrations"
     typer.echo(f"{output}: {counts}; {len(made.left_out)} left out")
 
 
 @app.command()
+@announced("reconstructing")
 def run(
     plan: Annotated[Path, typer.Argument(help="A plan of `diffuscope archive plan`.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the results; again to resume.")],
@@ -52,7 +51,7 @@ def run(
 
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("choose --workers on this machine or --scheduler, not both")
-    ran = run_plan(read_plan(plan), output, SystemClock(), _progress, workers, scheduler)
+    ran = run_plan(read_plan(plan), output, SystemClock(), say, workers, scheduler)
     typer.echo(
         f"{output}: {ran.done} with a result, {ran.quarantined} in quarantine, {ran.left_out} left out; "
         f"{ran.computed} computed in {ran.seconds:.0f} s"
@@ -63,6 +62,7 @@ def run(
 
 
 @app.command()
+@announced("writing the page")
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of `diffuscope archive run`.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Where to write the page, as HTML.")],
@@ -71,10 +71,11 @@ def report(
     from services.archive.report import write_report  # deferred: imports pyarrow, of the extra `archive`
 
     require_writable(output)
-    typer.echo(f"{output}: {write_report(folder, output, _progress)}")
+    typer.echo(f"{output}: {write_report(folder, output, say)}")
 
 
 @app.command()
+@announced("adopting")
 def adopt(
     folder: Annotated[Path, typer.Argument(help="Folder of `diffuscope archive run`.")],
     data: Annotated[Path, typer.Option(help="Where captures are kept; stop the instrument first.")],
@@ -82,11 +83,11 @@ def adopt(
     """Store the results as later versions of the captures; those as taken stay. Exit status 1 if some are refused."""
     from services.archive.adopt import adopt_results  # deferred: imports SQLAlchemy, of the extra `instrument`
 
-    done = adopt_results(folder, data, SystemClock(), _progress)
+    done = adopt_results(folder, data, SystemClock(), say)
     for one in done.refused[:20]:
-        _progress(f"refused: {one.id}: {one.reason}. {one.remedy}")
+        say(f"refused: {one.id}: {one.reason}. {one.remedy}")
     if len(done.refused) > 20:
-        _progress(f"and {len(done.refused) - 20} more")
+        say(f"and {len(done.refused) - 20} more")
     typer.echo(
         f"{data}: {done.adopted} adopted, {done.known} adopted before, {len(done.refused)} refused, "
         f"{done.missing} without a result"

@@ -11,6 +11,7 @@ from device.clock import SystemClock
 from device.errors import SpecError
 from device.user_files import read_text
 from services.records.store_command import Data, app, table
+from services.running_time import announcing, say
 
 if TYPE_CHECKING:
     from services.backup.backup_key import BackupHeader, BackupKey, SecretKey
@@ -42,7 +43,8 @@ def backup(
     chosen = new_key or recipient is not None or passphrase_file is not None
     needs_key = chosen or (read_key(data) is None and (data / "captures").is_dir())
     key = _new_key(recipient or [], passphrase_file) if needs_key else None
-    made = write_backup(data, to, SystemClock(), _percent("backed up"), key, verify)
+    with announcing("backing up"):
+        made = write_backup(data, to, SystemClock(), _percent("backed up"), key, verify)
     typer.echo(
         f"Backup {made.number} in {made.folder}: {made.units} folders, {made.written_bytes / 1e6:.1f} MB written, "
         "read back."
@@ -70,13 +72,14 @@ def restore(
 
     folder = find_folder(source)
     secret = _secret_key(read_header(folder), identity, passphrase_file)
-    found = restore_backup(folder, secret, data, _percent("restored"), number)
-    for one in found.damaged_backups:
-        typer.echo(f"Backup {one} is damaged; an older one is restored.", err=True)
-    for unit in found.damaged_units:
-        typer.echo(f"Damaged in the backup, not restored: {unit}", err=True)
-    CaptureStore(data).close()  # migrates the tables; where a record file is newer than its row, restores the row
-    results = check_store(data, lambda line: typer.echo(f"{line} ...", err=True))
+    with announcing("restoring"):
+        found = restore_backup(folder, secret, data, _percent("restored"), number)
+        for one in found.damaged_backups:
+            say(f"Backup {one} is damaged; an older one is restored.")
+        for unit in found.damaged_units:
+            say(f"Damaged in the backup, not restored: {unit}")
+        CaptureStore(data).close()  # migrates the tables; where a record file is newer than its row, restores the row
+        results = check_store(data, lambda line: say(f"{line} ..."))
     typer.echo(table(results))
     typer.echo(f"Backup {found.number} of {found.made_at:%Y-%m-%d %H:%M} UTC is restored in {data}.")
     if found.damaged_units or found.damaged_backups or not all(one.is_whole for one in results):
@@ -119,6 +122,6 @@ def _percent(verb: str) -> Callable[[int, int], None]:
         nonlocal shown
         if (tenth := 10 * done // max(total, 1)) > shown:
             shown = tenth
-            typer.echo(f"{verb} {done} of {total} ...", err=True)
+            say(f"{verb} {done} of {total} ...")
 
     return progress

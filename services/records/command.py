@@ -8,6 +8,7 @@ import typer
 from device import atomic_io
 from device.clock import SystemClock
 from services.errors import RecordNotFound
+from services.running_time import announced, announcing
 
 if TYPE_CHECKING:
     from services.records.snapshots import Snapshots
@@ -25,6 +26,7 @@ def _snapshots(data: Path) -> "Snapshots":
 
 
 @app.command("list")
+@announced("reading the snapshots")
 def list_snapshots(data: Data) -> None:
     """Name the snapshots, the oldest tables first."""
     for name in _snapshots(data).names():
@@ -47,5 +49,6 @@ def restore(
             typer.echo("The next start restores them, and later answers, from their files.")
         if not sure:
             typer.confirm(f"Go back to {name}?", abort=True)
-        aside = snapshots.restore(name)
+        with announcing("restoring the tables"):
+            aside = snapshots.restore(name)
     typer.echo(f"The tables are those of {name}. What they replaced is in {aside}.")

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from services.running_time import announced, announcing, say
+
 if TYPE_CHECKING:
     from services.records.store_check import Checked
 
@@ -16,6 +18,7 @@ Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 
 
 @app.command()
+@announced("checking what is stored")
 def check(
     data: Data,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -23,7 +26,7 @@ def check(
     """Read everything that is stored, change nothing, and name what is damaged; exit status 1 if something is."""
     from services.records.store_check import check_store  # deferred: imports SQLAlchemy
 
-    results = check_store(data, lambda line: typer.echo(f"{line} ...", err=True))
+    results = check_store(data, lambda line: say(f"{line} ..."))
     typer.echo(json.dumps([asdict(one) for one in results], indent=1) if as_json else table(results))
     if not all(one.is_whole for one in results):
         sys.exit(1)
@@ -41,10 +44,11 @@ def rebuild(
 
     if not sure:
         typer.confirm(f"Rebuild the database of {data}?", abort=True)
-    with storage_errors():
-        aside = rebuild_database(data)
-    with CaptureStore(data) as store:
-        report = store.recovery
+    with announcing("rebuilding the database"):
+        with storage_errors():
+            aside = rebuild_database(data)
+        with CaptureStore(data) as store:
+            report = store.recovery
     counts = f"{len(report.patients)} patients, {len(report.visits)} visits and {len(report.adopted)} captures"
     typer.echo(f"The database has {counts} from the files. The one before is in {aside}.")
 

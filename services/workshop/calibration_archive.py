@@ -14,6 +14,7 @@ from device.head import head_memory, refuse_unsuitable_calibration
 from device.ports import HeadMemory
 from device.values import HeadIdentity
 from services.research.reconstruct_file import parse_bayer
+from services.running_time import announced, say
 from services.workshop.calibration_words import details, printable, summary
 
 app = typer.Typer(
@@ -26,6 +27,7 @@ IdArgument = Annotated[str, typer.Argument(metavar="ID", help="As `calibrations 
 
 
 @app.command("list")
+@announced("reading the archive")
 def list_all(archive: ArchiveOption) -> None:
     """List every calibration that is kept, the oldest first; * marks the one in force."""
     kept = Archive(archive)
@@ -51,6 +53,7 @@ def _in_force(archive: Archive) -> str | None:
 
 
 @app.command()
+@announced("reading the archive")
 def show(id: IdArgument, archive: ArchiveOption) -> None:
     """Say all that is known of one calibration, and what is not."""
     kept = Archive(archive).load(id)
@@ -59,6 +62,7 @@ def show(id: IdArgument, archive: ArchiveOption) -> None:
 
 
 @app.command()
+@announced("putting a calibration in force")
 def use(id: IdArgument, archive: ArchiveOption, head: HeadOption = None) -> None:
     """Put a calibration in force, an earlier one too; with --head the head's memory is told."""
     kept = Archive(archive)
@@ -130,6 +134,7 @@ def make_key(
 
 
 @app.command("export")
+@announced("signing")
 def export_one(
     words: Annotated[
         list[str], typer.Argument(metavar="[ID] FILE", help="Which (else the one in force), and where to.")
@@ -149,6 +154,7 @@ def export_one(
 
 
 @app.command("import")
+@announced("importing")
 def import_one(
     file: Annotated[Path, typer.Argument(help="An exported calibration.")],
     archive: ArchiveOption,
@@ -174,6 +180,7 @@ def import_one(
 
 
 @app.command("import-psf")
+@announced("importing")
 def import_psf(
     psf: Annotated[list[Path], typer.Argument(help="PSF images: tiff, png or npy; several are a stack over depth.")],
     archive: ArchiveOption,
@@ -213,4 +220,4 @@ def import_psf(
     for line in summary(kept.load(id)):
         typer.echo(line)
     for note in found.notes:
-        typer.echo(f"note: {note}", err=True)
+        say(f"note: {note}")
