@@ -322,15 +322,14 @@ class Report:
     """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
 
     psf_cylinder: dict[str, float | None] | None = None
-    """Cylinder by which the PSF was warped beside its scale, and the predicted gain of the picture; null without one.
-    Not in earlier releases."""
+    """Cylinder by which the PSF was warped beside its scale, and the predicted gain of the picture; null without
+    one."""
 
     refraction_dpt: dict[str, float | str | None] | None = None
     """Refraction of the eye as correction at its pupil in dpt, negative for myopia; null without a known geometry."""
 
     refraction_scatter: dict[str, float] | None = None
-    """Scatter of the mean sphere between the frames of a burst; null for less than three frames. Not in earlier
-    releases."""
+    """Scatter of the mean sphere between the frames of a burst; null for less than three frames."""
 
     regularisation: dict[str, Any] = field(default_factory=dict)
     """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""
@@ -349,10 +348,10 @@ class Report:
     """Sentences for the operator, in English, the most useful first; the wording is not stable."""
 
     frames: tuple[FrameUse, ...] = (ONLY_FRAME,)
-    """What became of each frame of the burst, in its order; one entry for one frame. Not in earlier releases."""
+    """What became of each frame of the burst, in its order; one entry for one frame."""
 
     channels: tuple[ChannelUse, ...] = ()
-    """Colours of light of a colour picture; empty for a grey one. Not in earlier releases."""
+    """Colours of light of a colour picture; empty for a grey one."""
 
 
 @dataclass(frozen=True)

@@ -231,7 +231,7 @@ def swap(folder: Path, paths: list[Path], source: random.Random) -> str:
 
 def lose_table(folder: Path, _: list[Path], source: random.Random) -> str:
     """Drop one table, or remove all its rows while no trigger sees it, as damage does."""
-    with closing(sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)) as tables:
+    with closing(sqlite3.connect(folder / "store.sqlite", isolation_level=None)) as tables:
         names = [name for (name,) in tables.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
         name = source.choice(sorted(set(names) - {"alembic_version"}))
         if source.random() < 0.5:
@@ -259,7 +259,7 @@ DAMAGES: dict[str, Damage] = {
 def targets(folder: Path, which: str) -> list[Path]:
     """Return the files of a class: "database", "log", "ledger", "files" of records, or "settings" (all others)."""
     every = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
-    database = {"database": "shelf.sqlite", "log": "shelf.sqlite-wal"}
+    database = {"database": "store.sqlite", "log": "store.sqlite-wal"}
     if which in database:
         return [path for path in every if path.name == database[which]]
     if which == "ledger":
@@ -267,7 +267,7 @@ def targets(folder: Path, which: str) -> list[Path]:
     of_records = [path for path in every if path.relative_to(folder).parts[0] in RECORD_FOLDERS]
     if which == "files":
         return of_records
-    others = {"calibrations", "underway", "technician.json", KEY_FILE}
+    others = {"calibrations", "journal", "technician.json", KEY_FILE}
     return [path for path in every if path.relative_to(folder).parts[0] in others]
 
 

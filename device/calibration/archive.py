@@ -40,8 +40,7 @@ from device.values import Calibration, Colour, Geometry, Psf, RefractionOffset, 
 
 MANIFEST, CURRENT = "manifest.toml", "current"
 MAPS = ("dark_dn", "flat", "bad")
-FORMAT, OFFSET_FORMAT, WHITE_FORMAT = 1, 2, 3  # by what earlier releases cannot read: refraction offset, white card
-FORMATS = (FORMAT, OFFSET_FORMAT, WHITE_FORMAT)
+FORMAT = 1
 ID, NAME = re.compile("[0-9a-f]{16}"), re.compile(r"[a-z][a-z0-9_]*\.(npy|toml)")
 
 
@@ -212,7 +211,7 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     table = asdict(provenance) | {"made_at": provenance.made_at.isoformat(), "figures": None}
     table["unknown"] = list(provenance.unknown)
     return {
-        "format": _format(calibration),
+        "format": FORMAT,
         "id": calibration.id,
         "simulated": calibration.simulated,
         "field_deg": calibration.field_deg,
@@ -228,12 +227,6 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     }
 
 
-def _format(calibration: Calibration) -> int:
-    if calibration.white is not None:
-        return WHITE_FORMAT
-    return FORMAT if calibration.refraction_offset is None else OFFSET_FORMAT
-
-
 def _read_files(place: Path) -> dict[str, bytes]:
     try:
         return {path.name: path.read_bytes() for path in files_in(place) if path.is_file()}
@@ -243,9 +236,8 @@ def _read_files(place: Path) -> dict[str, bytes]:
 
 def _parse_manifest(files: Mapping[str, bytes]) -> dict[str, Any]:
     manifest = tomllib.loads(unsealed(_required_file(files, MANIFEST)))
-    if manifest["format"] not in FORMATS:
-        known = f"{FORMAT} to {WHITE_FORMAT}"
-        raise CalibrationFormat(f"this calibration was kept in format {manifest['format']}; known here are {known}")
+    if manifest["format"] != FORMAT:
+        raise CalibrationFormat(f"this calibration was kept in format {manifest['format']}; known here is {FORMAT}")
     return manifest
 
 

@@ -16,15 +16,17 @@ from device.errors import DailyLightLimit, LightLimit
 from device.values import Eye
 
 LONGEST_REST_S = 3 * 3600.0  # after a longer wait DailyLightLimit is raised: the light of the day is spent
-SLOT_S = 600.0  # doses are summed in slots, so that the ledger stays short; a slot counts until its last dose expires
+INTERVAL_S = (
+    600.0  # doses are summed by interval, so that the ledger stays short; each counts until its last dose expires
+)
 
 
 @dataclass(frozen=True)
 class Reserved:
-    """Reservation: `dose_j_per_cm2` for each of `eyes`, counted in ledger slot number `slot` before its delivery."""
+    """Reservation: `dose_j_per_cm2` for each of `eyes`, counted in interval number `interval` before its delivery."""
 
     eyes: tuple[Eye, ...]
-    slot: int
+    interval: int
     dose_j_per_cm2: float
 
 
@@ -43,7 +45,7 @@ class Ledger(Protocol):
 
 @dataclass
 class DoseLedgerState:
-    """State of the dose ledger: doses, J/cm2, by eye and slot number, and the observed time, s.
+    """State of the dose ledger: doses, J/cm2, by eye and interval number, and the observed time, s.
 
     `observed_s` grows only by differences of the monotonic clock within one boot, never by the date; `boot` and `now_s`
     are the boot id and the clock reading of the last `advance`.
@@ -55,19 +57,19 @@ class DoseLedgerState:
     now_s: float = 0.0
 
     def advance(self, boot: str, now_s: float, window_s: float) -> None:
-        """Add the time since the last call (nothing after a reboot), and delete the slots that no longer count."""
+        """Add the time since the last call (nothing after a reboot), and delete the intervals that no longer count."""
         if boot == self.boot:
             self.observed_s += max(0.0, now_s - self.now_s)
         self.boot, self.now_s = boot, now_s
-        for eye, slot in [key for key in self.doses if self.left_s(key[1], window_s) <= 0]:
-            del self.doses[eye, slot]
+        for eye, interval in [key for key in self.doses if self.left_s(key[1], window_s) <= 0]:
+            del self.doses[eye, interval]
 
-    def left_s(self, slot: int, window_s: float) -> float:
-        """Return for how long a slot still counts, s, with one slot length for light that continued past its end."""
-        return (slot + 2) * SLOT_S + window_s - self.observed_s
+    def left_s(self, interval: int, window_s: float) -> float:
+        """Return for how long an interval still counts, s, with one more for light that continued past its end."""
+        return (interval + 2) * INTERVAL_S + window_s - self.observed_s
 
     def spent(self, eye: Eye) -> float:
-        """Return the total dose of an eye over all slots, J/cm2."""
+        """Return the total dose of an eye over all intervals, J/cm2."""
         return sum(dose for (whose, _), dose in self.doses.items() if whose == eye)
 
     def wait_s(self, eye: Eye, dose_j_per_cm2: float, stop_j_per_cm2: float, window_s: float) -> float:
@@ -75,16 +77,16 @@ class DoseLedgerState:
         total = self.spent(eye) + dose_j_per_cm2
         if total <= stop_j_per_cm2:
             return 0.0
-        for slot in sorted(slot for whose, slot in self.doses if whose == eye):
-            total -= self.doses[eye, slot]
+        for interval in sorted(interval for whose, interval in self.doses if whose == eye):
+            total -= self.doses[eye, interval]
             if total <= stop_j_per_cm2:
-                return self.left_s(slot, window_s)
+                return self.left_s(interval, window_s)
         return float("inf")
 
-    def add(self, eyes: Iterable[Eye], slot: int, dose_j_per_cm2: float) -> None:
-        """Add a dose, J/cm2, to slot number `slot` of these eyes; a negative dose is subtracted, down to 0."""
+    def add(self, eyes: Iterable[Eye], interval: int, dose_j_per_cm2: float) -> None:
+        """Add a dose, J/cm2, to interval number `interval` of these eyes; a negative dose is subtracted, down to 0."""
         for eye in eyes:
-            self.doses[eye, slot] = max(0.0, self.doses.get((eye, slot), 0.0) + dose_j_per_cm2)
+            self.doses[eye, interval] = max(0.0, self.doses.get((eye, interval), 0.0) + dose_j_per_cm2)
 
     def reserve(
         self, eyes: Sequence[Eye], dose_j_per_cm2: float, stop_j_per_cm2: float, window_s: float, wall: datetime
@@ -94,14 +96,14 @@ class DoseLedgerState:
             wait_s = self.wait_s(eye, dose_j_per_cm2, stop_j_per_cm2, window_s)
             if wait_s > 0:
                 raise limit_error(eye, self.spent(eye), stop_j_per_cm2, wait_s, wall)
-        reserved = Reserved(tuple(eyes), int(self.observed_s // SLOT_S), dose_j_per_cm2)
-        self.add(reserved.eyes, reserved.slot, dose_j_per_cm2)
+        reserved = Reserved(tuple(eyes), int(self.observed_s // INTERVAL_S), dose_j_per_cm2)
+        self.add(reserved.eyes, reserved.interval, dose_j_per_cm2)
         return reserved
 
     def settle(self, reserved: Reserved, given_j_per_cm2: float) -> None:
-        """Replace a reservation by the delivered dose, J/cm2; a slot that no longer counts is not changed."""
-        counted = [eye for eye in reserved.eyes if (eye, reserved.slot) in self.doses]
-        self.add(counted, reserved.slot, given_j_per_cm2 - reserved.dose_j_per_cm2)
+        """Replace a reservation by the delivered dose, J/cm2; an interval that no longer counts is not changed."""
+        counted = [eye for eye in reserved.eyes if (eye, reserved.interval) in self.doses]
+        self.add(counted, reserved.interval, given_j_per_cm2 - reserved.dose_j_per_cm2)
 
 
 def limit_error(eye: Eye, spent_j_per_cm2: float, stop_j_per_cm2: float, wait_s: float, wall: datetime) -> LightLimit:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 class DoseReport:
     """Light of one exposure: its dose, the dose of each eye in 24 h, the limit (all J/cm2), eyes above the warning.
 
-    `limits_unchecked`: names of the limits that were not compared with the purchased standard. None and empty where the
-    report of an earlier release has no figure.
+    `limits_unchecked`: names of the limits that were not compared with the purchased standard. None and empty where
+    there is no figure.
     """
 
     dose_j_per_cm2: float | None = None

@@ -16,6 +16,7 @@ from services.backup.backup_key import SecretKey, read_header
 from services.backup.write_backup import MANIFEST, Manifest
 from services.errors import BackupDamaged, BackupKeyWrong, RestoreRefused
 from services.records import schema
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.restoration import begin_restoration, commit_restoration, finish_restoration
 from services.records.snapshots import carry_dose, refuse_in_use
 from services.records.storage_errors import storage_errors
@@ -23,7 +24,7 @@ from services.records.storage_errors import storage_errors
 log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
-RECORD_FOLDERS = ("captures", "patients", "visits", "torn")
+RECORD_FOLDERS = ("captures", "patients", "visits", "quarantine")
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,14 @@ def restore_backup(
     left out and named. A dose that the device has counted is never lowered. Until the last step nothing in the store
     changes; what a power cut interrupts after it, the next opening or restoration completes. Errors: RestoreRefused
     (the store has records), BackupKeyWrong, BackupDamaged (no backup can be read), UsbDriveUnavailable, StoreFull,
-    StoreError (the instrument is running, or the disk refuses).
+    StoreError (the instrument is running, the disk refuses, or store or backup are of a version before the first
+    release).
     """
     if key.public_key not in read_header(folder).recipients:
         raise BackupKeyWrong("the key is not that of these backups")
     with storage_errors():
         atomic_io.make_folder(store)
+        refuse_earlier_store(store / schema.DATABASE)
         refuse_in_use(store / schema.DATABASE)
         with atomic_io.file_lock(store / ".lock"):
             finish_restoration(store)  # of a restoration that was committed before a power cut
@@ -68,6 +71,7 @@ def restore_backup(
             _refuse_without_room(folder, manifest, len(rest), free_bytes(store))
             part = begin_restoration(store)
             _write_files(part, rest)
+            refuse_earlier_store(part / schema.DATABASE, f"the backup in {folder}")
             damaged = _write_units(part, folder, manifest, key, progress)
             carry_dose(store / schema.DATABASE, part / schema.DATABASE)
             _sync_folders(part)
@@ -96,7 +100,7 @@ def _refuse_used(store: Path) -> None:
     if database.exists() and database.stat().st_size and not used:
         with closing(sqlite3.connect(database)) as tables:
             names = {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}
-            for table in {"captures", "visits", "persons"} & names:
+            for table in {"captures", "visits", "patients"} & names:
                 if tables.execute(f"SELECT EXISTS (SELECT 1 FROM {table})").fetchone()[0]:
                     used.append(f"the table {table}")
     if used:

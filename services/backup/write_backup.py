@@ -13,6 +13,7 @@ from services.backup.backup_folder import BackupFolder
 from services.backup.backup_key import BackupKey, LastBackup, read_key, write_key
 from services.errors import BackupKeyWrong, RecordNotFound
 from services.records import schema
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
@@ -43,6 +44,7 @@ def write_backup(
     """
     if not (store / "captures").is_dir():
         raise RecordNotFound(f"{store} holds no captures", "Give the folder of the captures with --data.")
+    refuse_earlier_store(store / schema.DATABASE)
     with storage_errors():
         key = new_key or read_key(store)
         if key is None:

@@ -15,7 +15,6 @@ from services.records import digested_json
 MIN_DIGITS, MAX_DIGITS = 4, 12  # digits
 IDLE_TIMEOUT_S = 300.0
 MAX_LOCK_OUT_S = 300.0
-WITHOUT_DIGEST = frozenset({"salt", "hash"})  # entries of the file of an earlier release
 SCRYPT_COST: dict[str, int] = {"n": 2**14, "r": 8, "p": 1}  # scrypt: 16 MB and about 50 ms per guess
 
 
@@ -121,7 +120,7 @@ class PinAuthenticator:
 
     def _read_hash(self) -> tuple[bytes, bytes]:
         try:
-            stored = digested_json.decoded(self._file.read_bytes(), WITHOUT_DIGEST)
+            stored = digested_json.decoded(self._file.read_bytes())
             return bytes.fromhex(str(stored["salt"])), bytes.fromhex(str(stored["hash"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             message = f"the file with the technician's PIN is damaged: {error}"

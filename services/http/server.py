@@ -167,8 +167,8 @@ def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus) -> "Server"
 
 def _log_start(version: str, store: CaptureStore) -> None:
     log.info("started, version %s", version)
-    if torn := ", ".join(store.newly_quarantined):
-        log.warning("interrupted captures of the last run are quarantined in torn/: %s", torn)
+    if moved := ", ".join(store.newly_quarantined):
+        log.warning("interrupted captures of the last run are in quarantine/: %s", moved)
 
 
 def _open_exam(

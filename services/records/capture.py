@@ -11,7 +11,7 @@ from services.records.json_values import JsonObject
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
 COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
 OtherColour = Literal["red", "blue", "amber"]  # of light, besides the green one of the picture
-BUDGET_S = 5.0  # standard time budget, also of captures of earlier releases, whose report has none
+BUDGET_S = 5.0  # standard time budget, also of a report without one
 
 
 @dataclass(frozen=True)
@@ -133,9 +133,9 @@ class CaptureReport:
 
     `reconstruction.seconds`: durations by stage, with the exposure. `visit` and `slot`: ids, None for a test picture.
     `moved`: corrections of the eye, oldest first; `confirmed`: None unless the recorded eye was confirmed. `device`:
-    origin, None in captures of earlier releases. `versions`: later pictures, oldest first. `others`: entries of the
+    origin, None where it is unknown. `versions`: later pictures, oldest first. `others`: entries of the
     stored JSON that this release does not read or that have another type; they are written again unchanged. A field
-    that is missing in the report of an earlier release has its default.
+    that is missing in the stored report has its default.
     """
 
     reconstruction: Report = field(default_factory=lambda: Report(NO_METHOD, frames=()))

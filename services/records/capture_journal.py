@@ -1,7 +1,7 @@
 """Journal of captures in progress, written before their exposure, with the frames that were taken.
 
-    underway/<id>.json        entry of one capture in progress
-    underway/<id>/            its frames, until the capture is stored or has failed (frame_writer.py)
+    journal/<id>.json       entry of one capture in progress
+    journal/<id>/           its frames, until the capture is stored or has failed (frame_writer.py)
 
 After a kill or a power cut it lists the captures whose frames are reconstructed, and the captures to repeat.
 """
@@ -26,11 +26,9 @@ from services.records.json_values import JsonObject
 from services.records.record_document import whole_number
 from services.records.storage_errors import storage_errors
 
-UNDERWAY = "underway"  # folder of the journal in the store
+JOURNAL = "journal"  # folder in the store
 MAX_ATTEMPTS = 2  # starts that try to reconstruct the frames of a capture: they may be what ends the process
 _ATTEMPT = "attempt-{}"
-WITHOUT_KEY = frozenset({"id", "eye", "visit", "slot", "tries"})  # entries of earlier releases
-WITHOUT_DIGEST = WITHOUT_KEY | {"key"}
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class CaptureJournal:
     """
 
     def __init__(self, store: CaptureStore) -> None:
-        self._folder = store.folder / UNDERWAY
+        self._folder = store.folder / JOURNAL
         self._writers: dict[str, FrameWriter] = {}
         self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
@@ -242,7 +240,7 @@ def _key(path: Path) -> str | None:
 
 
 def _plan(path: Path) -> tuple[int, tuple[OtherColour, ...]] | None:
-    """Return the number of lit frames, and the other colours, that were to be taken; None if the entry has none."""
+    """Return the number of lit frames, and the other colours, that were to be taken; None if it cannot be read."""
     try:
         entries = _entries(path)
         colours = entries["colours"]
@@ -258,10 +256,7 @@ def _attempts(folder: Path) -> int:
 
 def _entries(path: Path) -> JsonObject:
     """Return the entries of a journal file; ValueError if it is incomplete or has changed."""
-    content = path.read_bytes()
-    with suppress(ValueError):
-        return digested_json.decoded(content, WITHOUT_DIGEST)
-    return digested_json.decoded(content, WITHOUT_KEY)
+    return digested_json.decoded(path.read_bytes())
 
 
 def _eye_in(name: str) -> Eye | None:

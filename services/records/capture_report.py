@@ -1,7 +1,7 @@
-"""JSON of a capture's report: one reader for the reports of every release, and one writer.
+"""JSON of a capture's report: one reader and one writer.
 
 The writer returns every entry that the reader was given: entries that this release does not read, or whose type it does
-not know, are in the `others` of the typed values. Entries that an earlier release did not write have their default.
+not know, are in the `others` of the typed values. Missing entries have their default.
 """
 
 from collections.abc import Callable, Mapping
@@ -140,7 +140,7 @@ def parse_report(stored: object) -> CaptureReport:
 
 
 def read_report(content: object) -> CaptureReport:
-    """Return the report with this JSON content, of any release.
+    """Return the report with this JSON content.
 
     ValueError or KeyError if the content is no JSON object, or if an entry on which the program acts has a wrong type:
     durations, budget, refraction, verdict, corrections, dose, visit and slot. A wrong type of another entry gives the

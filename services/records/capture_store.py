@@ -1,7 +1,7 @@
 """Capture store: atomic and durable storage of captures, even across a kill, a power cut or a full disk.
 
-    shelf.sqlite                  database: one row per stored capture; also visits and the dose ledger
-    shelf.sqlite-wal              write-ahead log: rows that are not in the main file yet (write_ahead_log.py)
+    store.sqlite                  database: one row per stored capture; also visits and the dose ledger
+    store.sqlite-wal              write-ahead log: rows that are not in the main file yet (write_ahead_log.py)
     captures/<id>/<name>          files of each capture
     captures/<id>/record.json     what the rows of the capture hold (record_document.py)
     patients/<id>.json            what the rows of a patient hold
@@ -10,8 +10,8 @@
     conflicts/                    states of records that another state replaced after a rollback (recovery.py)
     captures/.<id>.part/          capture being written; no row yet
     removed/                      files that were removed to make room (removed_captures.py)
-    torn/<id>/                    quarantine: captures found incomplete at an opening of the store; not listed, and
-                                  kept until their space is needed (quarantine.py)
+    quarantine/<id>/              captures found incomplete at an opening of the store; not listed, kept until their
+                                  space is needed (quarantine.py)
     snapshots/                    copies of the tables before each migration (snapshots.py)
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
@@ -45,6 +45,7 @@ from services.records.blobs import FileContent
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.capture_versions import CaptureVersions
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.quarantine import Quarantine
 from services.records.record_document import RecordDocument
 from services.records.record_files import CAPTURE_RECORD, RecordFiles
@@ -68,7 +69,7 @@ log = logging.getLogger(__name__)
 class CaptureStore:
     """Store of captures in one folder; opening it migrates the tables and moves incomplete captures to quarantine.
 
-    `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening, `recovery` what was
+    `newly_quarantined` holds the names in `quarantine/` of the folders moved there at this opening, `recovery` what was
     restored from the files of the records. With `refusal` the folder is a copy in memory (read_only_store.py): nothing
     is recovered or quarantined, and every change raises this error. `quarantine`, `versions`, `space` and
     `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a lock
@@ -91,16 +92,17 @@ class CaptureStore:
     ) -> None:
         self.folder, self.refusal = folder, refusal
         self._captures, self._lock = folder / "captures", folder / ".lock"
-        database, torn = folder / schema.DATABASE, folder / "torn"
+        database, quarantine = folder / schema.DATABASE, folder / "quarantine"
         with storage_errors(), ExitStack() as cleanup:
+            refuse_earlier_store(database)
             _make_private(folder)
             atomic_io.make_folder(self._captures)
-            atomic_io.make_folder(torn)
+            atomic_io.make_folder(quarantine)
             snapshots = Snapshots(database, clock or SystemClock(), free_bytes)
             self.engine = schema.open_engine(database)  # connects later
             cleanup.callback(self.engine.dispose)
             self.write_ahead_log = WriteAheadLog(database, self.engine)
-            self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
+            self.quarantine = Quarantine(self._captures, quarantine, self._lock, self.engine)
             self.removed = RemovedCaptures(self._captures, folder / "removed", self._lock)
             self.versions = CaptureVersions(self._captures, self._lock, self.engine)
             free = FreeSpace(folder, free_bytes, free_files)
@@ -281,8 +283,8 @@ class CaptureStore:
     def _set_damaged_database_aside(self) -> str | None:
         """Move a database that cannot be used to `damaged/`, so that it is rebuilt; return why, None for a usable one.
 
-        A store whose visits never had files cannot be rebuilt: its damaged database is opened as it is, row by row, and
-        StoreDamaged is raised if it is missing or empty, because a new one would have no rows for the captures.
+        A store without the folders of its visits cannot be rebuilt: its damaged database is opened as it is, row by
+        row, and StoreDamaged is raised if it is missing or empty, because a new one has no rows for the captures.
         """
         database = self.folder / schema.DATABASE
         damage = damage_of(database)
@@ -297,7 +299,7 @@ class CaptureStore:
     def _refuse_duplicate(self, *folders: Path) -> None:
         for folder in folders:
             if folder.exists():
-                raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
+                raise StoreError(f"{folder.name} is stored already", "Take the picture again.")
 
 
 def _make_private(folder: Path) -> None:

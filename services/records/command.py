@@ -18,11 +18,14 @@ Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 
 
 def _snapshots(data: Path) -> "Snapshots":
-    from services.records.snapshots import Snapshots  # deferred: imports SQLAlchemy
+    from services.records import schema  # deferred: imports SQLAlchemy
+    from services.records.earlier_stores import refuse_earlier_store
+    from services.records.snapshots import Snapshots
 
     if not (data / "captures").is_dir():
         raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
-    return Snapshots(data / "shelf.sqlite", SystemClock())
+    refuse_earlier_store(data / schema.DATABASE)
+    return Snapshots(data / schema.DATABASE, SystemClock())
 
 
 @app.command("list")

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from services.records.json_values import JsonObject, JsonValue
 
@@ -14,16 +14,11 @@ def encoded(entries: Mapping[str, JsonValue]) -> bytes:
     return json.dumps({**entries, DIGEST: _digest(entries)}, indent=1).encode()
 
 
-def decoded(content: bytes, earlier: Collection[str] = ()) -> JsonObject:
-    """Return the entries of an object that `encoded` wrote; ValueError if it has changed.
-
-    `earlier`: names of the entries of an object that an earlier release wrote without a digest.
-    """
+def decoded(content: bytes) -> JsonObject:
+    """Return the entries of an object that `encoded` wrote; ValueError if it has changed."""
     entries: JsonValue = json.loads(content)
     if not isinstance(entries, dict):
         raise ValueError(f"{type(entries).__name__} where an object was written")
-    if earlier and entries.keys() == set(earlier):
-        return entries
     rest = {name: value for name, value in entries.items() if name != DIGEST}
     if entries.get(DIGEST) != _digest(rest):
         raise ValueError("its SHA-256 differs")

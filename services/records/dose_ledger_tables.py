@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from device.clock import Clock, boot_id
 from device.errors import LightLimit, StoreError
-from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState, Reserved
+from device.light_safety.dose_ledger import INTERVAL_S, DoseLedgerState, Reserved
 from device.values import EYES, Eye
 from services.records import schema
 from services.records.dose_ledger_log import DoseLedgerLog, raise_to
@@ -30,10 +30,10 @@ def add_given_dose(session: Session, eye: Eye, dose_j_per_cm2: float) -> None:
     The dose is added to the interval of the last observed time of the ledger, which is at or after the exposure.
     """
     seen = session.get(ObservedTimeRow, 1)
-    slot = int(seen.observed_s // SLOT_S) if seen is not None else 0
-    row = session.get(DoseRow, (eye, slot))
+    interval = int(seen.observed_s // INTERVAL_S) if seen is not None else 0
+    row = session.get(DoseRow, (eye, interval))
     before = row.dose_j_per_cm2 if row is not None else 0.0
-    session.merge(DoseRow(eye=eye, slot=slot, dose_j_per_cm2=before + dose_j_per_cm2))
+    session.merge(DoseRow(eye=eye, interval=interval, dose_j_per_cm2=before + dose_j_per_cm2))
 
 
 class DoseLedgerStore:
@@ -55,7 +55,7 @@ class DoseLedgerStore:
         with self._writing() as state:
             if is_lost:
                 log.error("the dose ledger of a used device is gone: both eyes count as full")
-                state.add(EYES, int(state.observed_s // SLOT_S), LOST_J_PER_CM2)
+                state.add(EYES, int(state.observed_s // INTERVAL_S), LOST_J_PER_CM2)
 
     def spent_j_per_cm2(self, eye: Eye) -> float:
         """Return the dose (J/cm2) of an eye that still counts, including reservations that were never settled."""
@@ -99,19 +99,19 @@ class DoseLedgerStore:
             with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
                 state = self._state(session)
                 yield state
-                number = literal_column("light_doses.rowid", Integer)
-                rows = session.execute(select(number, DoseRow.eye, DoseRow.slot)).all()
-                gone = [row for row, eye, slot in rows if (eye, slot) not in state.doses]
+                number = literal_column("doses.rowid", Integer)
+                rows = session.execute(select(number, DoseRow.eye, DoseRow.interval)).all()
+                gone = [row for row, eye, interval in rows if (eye, interval) not in state.doses]
                 if gone:
                     session.execute(delete(DoseRow).where(number.in_(gone)), execution_options=_AS_IT_IS)
-                for (eye, slot), dose_j_per_cm2 in state.doses.items():
-                    session.merge(DoseRow(eye=eye, slot=slot, dose_j_per_cm2=dose_j_per_cm2))
+                for (eye, interval), dose_j_per_cm2 in state.doses.items():
+                    session.merge(DoseRow(eye=eye, interval=interval, dose_j_per_cm2=dose_j_per_cm2))
                 session.merge(ObservedTimeRow(id=1, boot=state.boot, now_s=state.now_s, observed_s=state.observed_s))
                 session.flush()
                 self._log.append(state)
         except StoreError as error:
             remedy = REMEDY if type(error) is StoreError else error.remedy
-            raise type(error)(f"the book of light cannot be written: {error.message}", remedy) from error
+            raise type(error)(f"the dose ledger cannot be written: {error.message}", remedy) from error
 
     def _is_lost(self) -> bool:
         """Return whether the store has captures, but neither table nor copy of the ledger has ever been written."""
@@ -124,7 +124,7 @@ class DoseLedgerStore:
         state = DoseLedgerState()
         for row in session.scalars(select(DoseRow)):
             eyes = (row.eye,) if row.eye in EYES else EYES  # unreadable eye: count for both
-            state.add(eyes, row.slot, row.dose_j_per_cm2)
+            state.add(eyes, row.interval, row.dose_j_per_cm2)
         seen = session.get(ObservedTimeRow, 1)
         if seen is not None:
             state.observed_s, state.boot, state.now_s = seen.observed_s, seen.boot, seen.now_s

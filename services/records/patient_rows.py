@@ -1,5 +1,7 @@
 """Rows of patients: the number of a known or new patient, and the counter of automatic numbers."""
 
+import secrets
+
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -24,7 +26,7 @@ def patient_number(session: Session, prefix: str, number: str | None, made_at: s
             raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
         number = known or number
     if session.get(PatientRow, number) is None:
-        session.add(PatientRow(number=number, made_at=made_at))
+        session.add(PatientRow(number=number, made_at=made_at, patient_id=secrets.token_hex(8)))
         session.flush()
     return number
 

@@ -14,11 +14,11 @@ log = logging.getLogger(__name__)
 
 REQUIRED_FILES = frozenset(
     {"raw.tiff", "picture.png", "quick.jpg", "report.json"}
-)  # complete capture, every release; a press that was interrupted may have no dark.tiff
+)  # of a complete capture; a press that was interrupted may have no dark.tiff
 
 
 class Quarantine:
-    """Quarantine of incomplete captures in `torn/`; the writer of a capture holds the lock file `lock`."""
+    """Quarantine of incomplete captures in `quarantine/`; the writer of a capture holds the lock file `lock`."""
 
     def __init__(self, captures: Path, folder: Path, lock: Path, engine: Engine) -> None:
         self._captures, self._folder, self._lock, self._engine = captures, folder, lock, engine
@@ -26,7 +26,7 @@ class Quarantine:
     def sizes_bytes(self) -> dict[str, int]:
         """Return the size (bytes) of each incomplete capture in quarantine by name, oldest first.
 
-        They are deleted if a new capture needs their space. Complete captures in `torn/` are orphans and not included.
+        They are deleted if a new capture needs their space. Complete captures among them are orphans and not included.
         """
         folders = [folder for folder in sorted(self._folder.iterdir()) if not _is_complete(folder)]
         return {folder.name: atomic_io.size_bytes(folder) for folder in folders}
@@ -38,7 +38,8 @@ class Quarantine:
     def orphans(self) -> list[str]:
         """Return the sorted names of the complete capture folders without a row, which the store never removes.
 
-        Complete folders in `torn/`, moved there by an earlier release, are included. Lists of captures omit orphans.
+        Complete folders in quarantine, which had all files but not yet their name, are included. Lists of captures omit
+        orphans.
         """
         with storage_errors(), atomic_io.file_lock(self._lock):  # a capture that is being written gets its row first
             folders = [*self.folders_without_row(), *self._folder.iterdir()]
@@ -51,7 +52,7 @@ class Quarantine:
         return sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
 
     def move_incomplete(self) -> tuple[str, ...]:
-        """Move each folder without a row that is a `.part` folder or lacks a required file to `torn/`.
+        """Move each folder without a row that is a `.part` folder or lacks a required file to `quarantine/`.
 
         Return the names there. Complete folders without a row stay.
         """

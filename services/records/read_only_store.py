@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 from device.clock import Clock
 from device.errors import StoreError, StoreFull, StoreReadOnly
-from services.records.capture_journal import UNDERWAY
+from services.records.capture_journal import JOURNAL
 from services.records.capture_store import CaptureStore
 from services.records.reserve_file import NAME, ReserveFile
 from services.records.storage_errors import storage_errors
@@ -22,7 +22,7 @@ from services.records.storage_errors import storage_errors
 log = logging.getLogger(__name__)
 
 MEMORY = Path("/dev/shm")  # the folder of temporary files may be on the disk that refuses
-READ_FROM_DISK = ("captures", "calibrations", "torn", "damaged", "conflicts")
+READ_FROM_DISK = ("captures", "calibrations", "quarantine", "damaged", "conflicts")
 NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "explorer"})
 
 
@@ -67,7 +67,7 @@ def _copy(source: Path, target: Path) -> None:
     if source.name in READ_FROM_DISK:
         target.symlink_to(source.absolute())
     elif source.is_dir() and source.name not in NOT_COPIED:
-        shutil.copytree(source, target, ignore=_no_frames if source.name == UNDERWAY else None)
+        shutil.copytree(source, target, ignore=_no_frames if source.name == JOURNAL else None)
     elif source.name not in NOT_COPIED:
         shutil.copy(source, target)
 

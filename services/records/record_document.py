@@ -1,10 +1,9 @@
 """Self-describing record of a patient, a visit or a capture: one JSON file that holds what its database rows hold.
 
-    {"format": 2, "kind": "visit", "revision": 3, "record": {"id": ..., ...}, "sha256": "..."}
+    {"format": 1, "kind": "visit", "revision": 3, "record": {"id": ..., ...}, "sha256": "..."}
 
 `sha256` is the digest of the canonical JSON (sorted keys, no spaces) of `kind`, `revision` and `record`. The rows hold
-the same revision and digest, so that a changed bit in either is detected, and the newer of the two is known. Format 1
-described captures only, without a revision; it is still read.
+the same revision and digest, so that a changed bit in either is detected, and the newer of the two is known.
 """
 
 import hashlib
@@ -15,7 +14,7 @@ from typing import Literal, get_args
 from services.records import row_validation
 from services.records.json_values import JsonObject, JsonValue
 
-FORMAT = 2
+FORMAT = 1
 Kind = Literal["patient", "visit", "capture"]
 
 
@@ -39,7 +38,8 @@ class RecordDocument:
 
     def sha256(self) -> str:
         """Return the SHA-256 (hexadecimal) of the canonical JSON of kind, revision and content."""
-        return _digest(self._signed())
+        canonical = json.dumps(self._signed(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(canonical.encode()).hexdigest()
 
     def encoded(self) -> bytes:
         """Return the content of the file."""
@@ -51,19 +51,13 @@ class RecordDocument:
 
 
 def parse_document(content: bytes) -> RecordDocument:
-    """Return the document in a file; ValueError, TypeError or KeyError if it is no document or differs from its digest.
-
-    A capture in format 1 has revision 0.
-    """
+    """Return the document in a file; ValueError, TypeError or KeyError if it is none or differs from its digest."""
     entries = as_object(row_validation.parsed_json(content.decode()))
-    if entries["format"] == 1:
-        capture = as_object(entries["capture"])
-        _refuse_other_digest(_digest(capture), entries["sha256"])
-        return RecordDocument("capture", 0, {**capture, "request": None})
     kind: Kind = row_validation.one_of(entries["kind"], *get_args(Kind))
     row_validation.one_of(entries["format"], FORMAT)
     document = RecordDocument(kind, whole_number(entries["revision"]), as_object(entries["record"]))
-    _refuse_other_digest(document.sha256(), entries["sha256"])
+    if document.sha256() != entries["sha256"]:
+        raise ValueError("the SHA-256 of the record differs")
     return document
 
 
@@ -86,13 +80,3 @@ def as_number(value: object) -> float:
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ValueError(f"{value!r:.60} where a number was kept")
     return float(value)
-
-
-def _refuse_other_digest(digest: str, expected: object) -> None:
-    if digest != expected:
-        raise ValueError("the SHA-256 of the record differs")
-
-
-def _digest(entries: JsonObject) -> str:
-    canonical = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(canonical.encode()).hexdigest()

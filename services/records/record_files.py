@@ -23,7 +23,7 @@ class RecordFiles:
         self._folder = folder
 
     def exist(self) -> bool:
-        """Return whether every visit of this store has had a file, so that its rows can be rebuilt from the files."""
+        """Return whether the folders of the files are here, so that the rows of visits can be rebuilt from them."""
         return all((self._folder / name).is_dir() for name in _FOLDERS.values())
 
     def make_folders(self) -> None:

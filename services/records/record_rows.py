@@ -34,7 +34,7 @@ from services.records.schema import (
 )
 
 CAPTURE_VALUES = ("eye", "taken_at", "simulated", "calibration_id", "report", "request")
-MOST_OF_ONE_NUMBER = 99  # patients that got the same number from several releases
+MOST_OF_ONE_NUMBER = 99  # patients that got the same number after restorations of older tables
 IDENTITY_VERSION = 1  # version of the encoding of the identifying fields
 Content = dict[str, JsonValue]
 R = TypeVar("R", PatientRow, VisitRow)
@@ -69,8 +69,8 @@ def patient_contents(session: Session, rows: Sequence[PatientRow]) -> dict[str, 
     The identifying fields are one opaque text, which a later release may encrypt; `version` names its encoding.
     """
     numbers = row_validation.readable_keys(row.number for row in rows)
-    query = select(IdentifierRow).where(IdentifierRow.person.in_(numbers))
-    fields = _grouped((row.person, row.name, row.value) for row in session.scalars(query) if row is not None)
+    query = select(IdentifierRow).where(IdentifierRow.patient.in_(numbers))
+    fields = _grouped((row.patient, row.name, row.value) for row in session.scalars(query) if row is not None)
 
     def content(row: PatientRow) -> Content:
         values = {name: _parsed(value) for name, value in fields[row.number]}
@@ -90,15 +90,15 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
     slots = _grouped((row.visit, row.slot, (row.capture, row.reason)) for row in decided if row is not None)
     sent = session.scalars(select(UploadRow).where(UploadRow.visit.in_(ids), UploadRow.sent_at.is_not(None)))
     uploads = _grouped((row.visit, row.finished_at, row) for row in sent if row is not None)
-    numbers = row_validation.readable_keys(row.person for row in rows)
+    numbers = row_validation.readable_keys(row.patient for row in rows)
     query = select(PatientRow.number, PatientRow.patient_id).where(PatientRow.number.in_(numbers))
-    patients: dict[str, str | None] = {one.number: one.patient_id for one in session.execute(query)}
+    patients: dict[str, str] = {one.number: one.patient_id for one in session.execute(query)}
 
     def content(row: VisitRow) -> Content:
         return {
             "id": row.id,
-            "patient_id": patients.get(row.person),
-            "number": row.person,
+            "patient_id": patients.get(row.patient),
+            "number": row.patient,
             "day": row.day,
             "begun_at": row.begun_at,
             "finished_at": row.finished_at,
@@ -116,16 +116,16 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
 def restore_patient(session: Session, content: JsonObject) -> bool:
     """Write the rows of a patient as described; return whether the number could stay.
 
-    If another patient has the number, as after a rollback on older tables, this one gets the number with the first free
-    of the endings "-2", "-3", ...: two patients are never mixed up. ValueError, TypeError or KeyError for a content of
-    another form.
+    If another patient has the number, as after the restoration of older tables, this one gets the number with the first
+    free of the endings "-2", "-3", ...: two patients are never mixed up. ValueError, TypeError or KeyError for a
+    content of another form.
     """
     row, identifiers = _patient_rows(content)
     described = row.number
     row.number = _free_number(session, described, row.patient_id)
     for one in identifiers:
-        one.person = row.number
-    session.execute(delete(IdentifierRow).where(IdentifierRow.person == row.number))
+        one.patient = row.number
+    session.execute(delete(IdentifierRow).where(IdentifierRow.patient == row.number))
     session.merge(row)
     session.flush()
     session.add_all(identifiers)
@@ -133,7 +133,7 @@ def restore_patient(session: Session, content: JsonObject) -> bool:
     return row.number == described
 
 
-def _free_number(session: Session, number: str, patient_id: str | None) -> str:
+def _free_number(session: Session, number: str, patient_id: str) -> str:
     """Return the number that the patient with this id has, else the number itself or the first free one beside it."""
     known = session.scalar(select(PatientRow.number).where(PatientRow.patient_id == patient_id))
     if known is not None:
@@ -151,10 +151,10 @@ def restore_visit(session: Session, content: JsonObject) -> bool:
     A patient without rows gets a row with that number and no identifying field. Errors as in `restore_patient`.
     """
     row, answers, uploads, _ = _visit_rows(content)
-    described, patient_id = row.person, _text_or_none(content["patient_id"])
-    row.person = _free_number(session, described, patient_id)
-    if session.get(PatientRow, row.person) is None:
-        session.add(PatientRow(number=row.person, made_at=row.begun_at, patient_id=patient_id))
+    described, patient_id = row.patient, row_validation.text(content["patient_id"])
+    row.patient = _free_number(session, described, patient_id)
+    if session.get(PatientRow, row.patient) is None:
+        session.add(PatientRow(number=row.patient, made_at=row.begun_at, patient_id=patient_id))
         session.flush()
     session.execute(delete(AnswerRow).where(AnswerRow.visit == row.id))
     session.execute(delete(UploadRow).where(UploadRow.visit == row.id, UploadRow.sent_at.is_not(None)))
@@ -165,7 +165,7 @@ def restore_visit(session: Session, content: JsonObject) -> bool:
     for upload in uploads:
         session.merge(upload)
     session.flush()
-    return row.person == described
+    return row.patient == described
 
 
 def restore_decisions(session: Session, content: JsonObject) -> list[str]:
@@ -219,7 +219,7 @@ def restore_capture(session: Session, row: CaptureRow) -> None:
 def restore_slots(session: Session) -> list[str]:
     """Write visit and slot of each capture as its report has them, for known visits; return the ids of those changed.
 
-    The report is what the record of the capture holds, so that a lost or changed row of `shots` is found.
+    The report is what the record of the capture holds, so that a lost or changed row of `capture_slots` is found.
     """
     query = (
         select(CaptureRow.id, CaptureRow.visit, CaptureRow.slot, CaptureSlotRow)
@@ -250,7 +250,7 @@ def _patient_rows(content: JsonObject) -> tuple[PatientRow, list[IdentifierRow]]
     blob = base64.b64decode(row_validation.text(identity["blob"]), validate=True)
     values = as_object(row_validation.parsed_json(blob.decode()))
     row = PatientRow(number=number, made_at=_moment(content["made_at"]), patient_id=row_validation.text(content["id"]))
-    return row, [IdentifierRow(person=number, name=name, value=json.dumps(value)) for name, value in values.items()]
+    return row, [IdentifierRow(patient=number, name=name, value=json.dumps(value)) for name, value in values.items()]
 
 
 def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[UploadRow], list[SlotDecisionRow]]:
@@ -259,7 +259,7 @@ def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[Up
     finished_at, sent, request = (_text_or_none(content[name]) for name in ("finished_at", "sent", "request"))
     row = VisitRow(
         id=id,
-        person=row_validation.text(content["number"]),
+        patient=row_validation.text(content["number"]),
         day=_day(content["day"]),
         begun_at=_moment(content["begun_at"]),
         finished_at=None if finished_at is None else _moment(finished_at),

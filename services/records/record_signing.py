@@ -1,12 +1,11 @@
 """Signing of records: changed patients, visits and captures get a new revision and digest in their rows, and a file.
 
-A transaction changes rows; triggers make the digest of each changed record null (migration r0006). `recorded` signs
+A transaction changes rows; triggers make the digest of each changed record null. `recorded` signs
 these records and replaces their files before it commits, so that each acknowledged state is in the database and in a
 file. After a kill in between the file is one revision ahead, and recovery.py takes it over.
 """
 
 import logging
-import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -123,8 +122,6 @@ def _sign_kind(session: Session, kind: Kind) -> list[RecordDocument]:
     signed = []
     for start in range(0, len(keys), PAGE_ROWS):
         page = keys[start : start + PAGE_ROWS]
-        if kind == "patient":
-            _name_patients(session, page)
         session.expire_all()
         for document in documents_of(session, kind, page):
             following = RecordDocument(kind, document.revision + 1, document.content)
@@ -142,14 +139,6 @@ def write_signature(session: Session, document: RecordDocument) -> None:
         .values(revision=document.revision, record_sha256=document.sha256())
         .execution_options(synchronize_session=False)
     )
-
-
-def _name_patients(session: Session, numbers: Sequence[str]) -> None:
-    """Give patients without an id a random one."""
-    query = select(PatientRow).where(PatientRow.number.in_(numbers), PatientRow.patient_id.is_(None))
-    for row in session.scalars(query):
-        row.patient_id = secrets.token_hex(8)
-    session.flush()
 
 
 def _write_as_before(session: Session, files: RecordFiles, written: Iterable[RecordDocument]) -> None:

@@ -7,7 +7,7 @@ patient, a visit or a capture is in its rows and in a file (record_document.py),
     whole, signed           same revision           none
     whole, newer            older or damaged        write the file
     whole, older            newer                   restore the rows from the file
-    whole, unsigned         no newer revision       sign the rows, write the file (an earlier release changed them)
+    whole, unsigned         no newer revision       sign the rows, write the file (another program changed them)
     whole, unsigned         newer, other content    the later change is used, the other is stored in `conflicts/`
     another patient's       whole                   restore with another number: patients are never mixed up
     damaged or missing      whole                   restore the rows from the file
@@ -30,6 +30,7 @@ from device.errors import StoreError
 from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records import record_rows, row_validation, schema
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.json_values import JsonObject
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles
@@ -67,7 +68,7 @@ def damage_of(database: Path) -> str | None:
         if isinstance(error, sqlite3.OperationalError) and sqlite_name(error) != "SQLITE_ERROR":
             raise  # busy, or refused by the disk: nothing is known about the content
         return str(error)
-    if found == "ok" and checksum not in (0, schema.schema_checksum(tables)):  # 0: of an earlier release
+    if found == "ok" and checksum != (schema.schema_checksum(tables) if tables else 0):
         return "the definitions of its tables are not those that were written"
     return None if found == "ok" else str(found)
 
@@ -102,7 +103,6 @@ class Recovery:
         return self.report
 
     def _run(self, session: Session) -> None:
-        self._name_known_patients(session)
         to_write = [*self._reconcile(session, "patient"), *self._reconcile(session, "visit")]
         suspicious = {*self.report.visits, *(one.id for one in to_write if one.kind == "visit")}
         to_write += self._reconcile(session, "capture", suspicious)
@@ -114,23 +114,7 @@ class Recovery:
                 write_signature(session, document)
         self._files.write_all([*to_write, *sign_changed(session)])
 
-    def _name_known_patients(self, session: Session) -> None:
-        """Give patients without an id, which an earlier release made or older tables hold, the id in their file.
-
-        A patient with the same number that was made at another moment is another one: after a rollback on older tables
-        the earlier release may have given the number again.
-        """
-        nameless = session.scalars(select(PatientRow).where(PatientRow.patient_id.is_(None))).all()
-        if not nameless:
-            return
-        documents = (self._file("patient", id) for id in self._files.ids("patient"))
-        ids = {(one.content["number"], one.content["made_at"]): one.id for one in documents if one is not None}
-        for row in nameless:
-            if row is not None:
-                row.patient_id = ids.get((row.number, row.made_at))
-        session.flush()
-
-    def _id_in_file(self, damaged: PatientRow) -> str | None:
+    def _id_in_file(self, damaged: PatientRow) -> str:
         """Return the id of the patient whose file has the number of a damaged row, which may have another id."""
         documents = (self._file("patient", id) for id in self._files.ids("patient"))
         numbered = [one for one in documents if one is not None and one.content["number"] == damaged.number]
@@ -151,7 +135,7 @@ class Recovery:
                 if isinstance(row, PatientRow) and rows_document is None and row.record_sha256 is not None:
                     row.patient_id = self._id_in_file(row)
                     session.flush()
-                id = row.patient_id or "" if isinstance(row, PatientRow) else row.id
+                id = row.patient_id if isinstance(row, PatientRow) else row.id
                 known.add(id)
                 if _is_settled(kind, row, rows_document, of_visits):
                     continue
@@ -186,7 +170,7 @@ class Recovery:
     def _settle_conflict(self, session: Session, in_rows: RecordDocument, in_file: RecordDocument) -> None:
         """Use the state that was changed later, the file's if both are equally late; store the other beside it.
 
-        Conflicts arise after a rollback on older tables: the earlier release changed what a later one had changed.
+        Conflicts arise after older tables were restored: what had been changed was changed once more.
         """
         use_file = _last_change(in_file.content) >= _last_change(in_rows.content)
         folder, other = self._folder / "conflicts", in_rows if use_file else in_file
@@ -219,7 +203,7 @@ class Recovery:
                     (self.report.healed if known else self.report.adopted).append(document.id)
                 if not as_described:
                     self.report.conflicts.append(document.id)
-                elif document.revision:
+                else:
                     write_signature(session, document)
         except StoreError as error:
             log.error("rows of the %s %s were not restored: %s", document.kind, document.id, error)
@@ -310,11 +294,12 @@ def _timestamps(value: object) -> list[datetime]:
 def rebuild_database(folder: Path) -> Path:
     """Move the database of a store that is not in use aside; the next opening rebuilds it. Return where it is now.
 
-    Errors: StoreDamaged (the files of the records of this store were never all written), StoreError (the instrument is
-    running), OSError.
+    Errors: StoreDamaged (the folders of the files are missing), StoreError (the instrument is running, or the store is
+    of a version before the first release), OSError.
     """
+    refuse_earlier_store(folder / schema.DATABASE)
     if not RecordFiles(folder).exist():
-        raise StoreDamaged(f"{folder} has no files of its visits", "Start this release once with the present database.")
+        raise StoreDamaged(f"{folder} has no files of its visits", "Copy them back beside the database first.")
     refuse_in_use(folder / schema.DATABASE)
     with atomic_io.file_lock(folder / ".lock"):
         return set_aside(folder / schema.DATABASE)

@@ -39,8 +39,9 @@ from device import atomic_io
 from device.errors import SettingError, StoreError
 from services.records.capture import Capture
 from services.records.capture_report import report_as_json
+from services.records.earlier_stores import refuse_earlier_tables
 
-DATABASE = "shelf.sqlite"  # as the first release named it
+DATABASE = "store.sqlite"
 MIGRATIONS = Path(__file__).parent / "migrations"
 
 # WAL with FULL is the fastest pair that lost no acknowledged row in power-cut trials; NORMAL lost the last ones.
@@ -73,8 +74,8 @@ UNSIGNED = "record_sha256 IS NULL"
 class RecordColumns:
     """Columns of the row of a record: its revision and digest (record_document.py).
 
-    A trigger makes `record_sha256` null when a value of the record is changed, also by an earlier release, until the
-    record is signed again (record_signing.py).
+    A trigger makes `record_sha256` null when a value of the record is changed, until the record is signed again
+    (record_signing.py).
     """
 
     revision: Mapped[int] = mapped_column(server_default="0")
@@ -85,8 +86,8 @@ class CaptureRow(RecordColumns, Base):
     """One stored capture; `report` is JSON, `simulated` 0 or 1.
 
     `taken_at` is UTC text with six decimals of the second, so that text order is time order. SQLite computes `visit`,
-    `slot`, `verdict` and `laterality` (the last two JSON objects) from the report: they stand in one place, also after
-    a write by an earlier release. `request`: idempotency key of its press and SHA-256 of that request, or null.
+    `slot`, `verdict` and `laterality` (the last two JSON objects) from the report: they stand in one place.
+    `request`: idempotency key of its press and SHA-256 of that request, or null.
     """
 
     __tablename__ = "captures"
@@ -140,18 +141,18 @@ class FileRow(Base):
 class DoseRow(Base):
     """Dose (J/cm2) of one eye in one interval of observed time, including reservations that were not settled.
 
-    `slot`: number of the interval, counted in SLOT_S from observed time 0.
+    `interval`: number of the interval, counted in INTERVAL_S from observed time 0.
     """
 
-    __tablename__ = "light_doses"
+    __tablename__ = "doses"
 
     eye: Mapped[str] = mapped_column(Text, primary_key=True)
-    slot: Mapped[int] = mapped_column(primary_key=True)
+    interval: Mapped[int] = mapped_column(primary_key=True)
     dose_j_per_cm2: Mapped[float] = mapped_column(REAL)
 
     __table_args__ = (
-        CheckConstraint("eye IN ('OD', 'OS')", name="light_fell_on_an_eye"),
-        CheckConstraint("dose_j_per_cm2 >= 0", name="light_is_not_given_back"),
+        CheckConstraint("eye IN ('OD', 'OS')", name="dose_is_of_an_eye"),
+        CheckConstraint("dose_j_per_cm2 >= 0", name="dose_is_not_negative"),
         {"sqlite_strict": True},
     )
 
@@ -162,30 +163,27 @@ class ObservedTimeRow(Base):
     `boot` and `now_s`: boot id and monotonic time (s) of the last observation; `observed_s`: total observed time (s).
     """
 
-    __tablename__ = "light_time"
+    __tablename__ = "observed_time"
 
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     boot: Mapped[str] = mapped_column(Text)
     now_s: Mapped[float] = mapped_column(REAL)
     observed_s: Mapped[float] = mapped_column(REAL)
 
-    __table_args__ = (CheckConstraint("id = 1", name="time_is_one"), {"sqlite_strict": True})
+    __table_args__ = (CheckConstraint("id = 1", name="time_is_one_row"), {"sqlite_strict": True})
 
 
 class PatientRow(RecordColumns, Base):
-    """One patient: patient number, time of creation (UTC), and an opaque random id; no identifying field.
+    """One patient: patient number, time of creation (UTC), and an opaque random id; no identifying field."""
 
-    A patient that an earlier release made has no `patient_id` until its record is signed.
-    """
-
-    __tablename__ = "persons"
+    __tablename__ = "patients"
 
     number: Mapped[str] = mapped_column(Text, primary_key=True)
     made_at: Mapped[str] = mapped_column(Text)
-    patient_id: Mapped[str | None] = mapped_column(Text)
+    patient_id: Mapped[str] = mapped_column(Text)
 
     __table_args__ = (
-        Index("persons_to_sign", "number", sqlite_where=text(UNSIGNED)),
+        Index("patients_to_sign", "number", sqlite_where=text(UNSIGNED)),
         CheckConstraint("length(number) BETWEEN 1 AND 20", name="number_is_short"),
         {"sqlite_strict": True},
     )
@@ -196,7 +194,7 @@ class IdentifierRow(Base):
 
     __tablename__ = "identifiers"
 
-    person: Mapped[str] = mapped_column(Text, ForeignKey("persons.number"), primary_key=True)
+    patient: Mapped[str] = mapped_column(Text, ForeignKey("patients.number"), primary_key=True)
     name: Mapped[str] = mapped_column(Text, primary_key=True)
     value: Mapped[str] = mapped_column(Text)
 
@@ -207,11 +205,11 @@ class IdentifierRow(Base):
     )
 
 
-UNSENT = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at)"
+NOT_UPLOADED = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at)"
 
 
 class VisitRow(RecordColumns, Base):
-    """One visit of the patient with number `person`; `day` is the local date of its start, timestamps are UTC.
+    """One visit of the patient with number `patient`; `day` is the local date of its start, timestamps are UTC.
 
     `finished_at` and `outcome` (JSON) are null in an unfinished visit. `request`: idempotency key of the request that
     began it and SHA-256 of that request, or null.
@@ -220,7 +218,7 @@ class VisitRow(RecordColumns, Base):
     __tablename__ = "visits"
 
     id: Mapped[str] = mapped_column(Text, primary_key=True)
-    person: Mapped[str] = mapped_column(Text, ForeignKey("persons.number"))
+    patient: Mapped[str] = mapped_column(Text, ForeignKey("patients.number"))
     day: Mapped[str] = mapped_column(Text)
     begun_at: Mapped[str] = mapped_column(Text)
     finished_at: Mapped[str | None] = mapped_column(Text)
@@ -229,13 +227,13 @@ class VisitRow(RecordColumns, Base):
     request: Mapped[str | None] = mapped_column(Text)
 
     __table_args__ = (
-        CheckConstraint("(finished_at IS NULL) = (outcome IS NULL)", name="what_is_finished_has_an_outcome"),
+        CheckConstraint("(finished_at IS NULL) = (outcome IS NULL)", name="finished_has_an_outcome"),
         CheckConstraint("outcome IS NULL OR json_valid(outcome)", name="outcome_is_json"),
         Index("visits_by_time", "begun_at", "id"),
         Index("visits_by_day", "day"),
         Index("visits_to_sign", "id", sqlite_where=text(UNSIGNED)),
         Index(
-            "visits_to_send", "finished_at", sqlite_where=text(UNSENT)
+            "visits_to_upload", "finished_at", sqlite_where=text(NOT_UPLOADED)
         ),  # partial index: only visits in the upload queue
         {"sqlite_strict": True},
     )
@@ -247,7 +245,7 @@ VISIT_ROWID = literal_column("visits.rowid", Integer)  # grows with each begun v
 class AnswerRow(Base):
     """One answer of a visit to the form field `name`; `value` is JSON, `set_at` the UTC time of the answer."""
 
-    __tablename__ = "fields"
+    __tablename__ = "answers"
 
     visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
     name: Mapped[str] = mapped_column(Text, primary_key=True)
@@ -255,8 +253,8 @@ class AnswerRow(Base):
     set_at: Mapped[str] = mapped_column(Text)
 
     __table_args__ = (
-        CheckConstraint("json_valid(value)", name="field_is_json"),
-        CheckConstraint("length(value) <= 2000", name="field_is_short"),
+        CheckConstraint("json_valid(value)", name="answer_is_json"),
+        CheckConstraint("length(value) <= 2000", name="answer_is_short"),
         {"sqlite_strict": True},
     )
 
@@ -264,19 +262,19 @@ class AnswerRow(Base):
 class CaptureSlotRow(Base):
     """Visit and picture slot of a capture; a test picture has no such row."""
 
-    __tablename__ = "shots"
+    __tablename__ = "capture_slots"
 
     capture: Mapped[str] = mapped_column(Text, ForeignKey("captures.id"), primary_key=True)
     visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"))
     slot: Mapped[str] = mapped_column(Text)
 
-    __table_args__ = (Index("shots_by_visit", "visit"), {"sqlite_strict": True})
+    __table_args__ = (Index("capture_slots_by_visit", "visit"), {"sqlite_strict": True})
 
 
 class SlotDecisionRow(Base):
     """Decision on one slot: the chosen `capture`, or the `reason` why no picture was possible, or neither (emptied)."""
 
-    __tablename__ = "slots"
+    __tablename__ = "slot_decisions"
 
     visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
     slot: Mapped[str] = mapped_column(Text, primary_key=True)
@@ -284,7 +282,7 @@ class SlotDecisionRow(Base):
     reason: Mapped[str | None] = mapped_column(Text)
 
     __table_args__ = (
-        CheckConstraint("capture IS NULL OR reason IS NULL", name="taken_or_could_not"),
+        CheckConstraint("capture IS NULL OR reason IS NULL", name="capture_or_reason"),
         {"sqlite_strict": True},
     )
 
@@ -292,27 +290,27 @@ class SlotDecisionRow(Base):
 class UploadRow(Base):
     """State of the upload of a visit as finished at `finished_at`; no row before the first attempt.
 
-    `tries`: number of attempts; `failing_since`: time of the first failure; `error` and `said`: code and message of the
-    last one, null after success. `sent_at`, `sha256`, `confirmed`: time of the upload, digest of the archive, and
+    `tries`: number of attempts; `failing_since`: time of the first failure; `error` and `message`: code and message
+    of the last one, null after success. `sent_at`, `sha256`, `confirmed`: time of the upload, digest of the archive,
     method of the receiver's confirmation ("sha256", or "length" only); null before success.
     """
 
-    __tablename__ = "sendings"
+    __tablename__ = "uploads"
 
     visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
     finished_at: Mapped[str] = mapped_column(Text, primary_key=True)
     tries: Mapped[int]
     failing_since: Mapped[str | None] = mapped_column(Text)
     error: Mapped[str | None] = mapped_column(Text)
-    said: Mapped[str | None] = mapped_column(Text)
+    message: Mapped[str | None] = mapped_column(Text)
     sent_at: Mapped[str | None] = mapped_column(Text)
     sha256: Mapped[str | None] = mapped_column(Text)
     confirmed: Mapped[str | None] = mapped_column(Text)
 
     __table_args__ = (
-        CheckConstraint("tries >= 0", name="tries_are_counted"),
-        CheckConstraint("(sent_at IS NULL) = (sha256 IS NULL)", name="what_was_sent_is_known"),
-        CheckConstraint("(sent_at IS NULL) = (confirmed IS NULL)", name="what_was_sent_was_confirmed"),
+        CheckConstraint("tries >= 0", name="tries_are_not_negative"),
+        CheckConstraint("(sent_at IS NULL) = (sha256 IS NULL)", name="sent_has_a_digest"),
+        CheckConstraint("(sent_at IS NULL) = (confirmed IS NULL)", name="sent_has_a_confirmation"),
         {"sqlite_strict": True},
     )
 
@@ -325,13 +323,13 @@ class CounterRow(Base):
     prefix: Mapped[str] = mapped_column(Text, primary_key=True)
     last: Mapped[int]
 
-    __table_args__ = (CheckConstraint("last >= 0", name="counters_count"), {"sqlite_strict": True})
+    __table_args__ = (CheckConstraint("last >= 0", name="counter_is_not_negative"), {"sqlite_strict": True})
 
 
 class IdempotencyKeyRow(Base):
     """Idempotency key of a completed request, with the SHA-256 of the request and the answer, such as a visit id."""
 
-    __tablename__ = "keys"
+    __tablename__ = "idempotency_keys"
 
     key: Mapped[str] = mapped_column(Text, primary_key=True)
     request: Mapped[str] = mapped_column(Text)
@@ -340,7 +338,7 @@ class IdempotencyKeyRow(Base):
 
     __table_args__ = (
         CheckConstraint("length(key) = 16", name="key_is_whole"),
-        Index("keys_by_time", "done_at"),
+        Index("idempotency_keys_by_time", "done_at"),
         {"sqlite_strict": True},
     )
 
@@ -448,18 +446,22 @@ def lock_briefly(engine: Engine) -> None:
             connection.execute(f"PRAGMA busy_timeout = {BUSY_MS}").close()
 
 
-def migrate(engine: Engine, before: Callable[[str], None]) -> None:
+def migrate(engine: Engine, before: Callable[[str], None], migrations: Path = MIGRATIONS) -> None:
     """Migrate the tables to the schema of this release in one transaction; leave tables of a newer schema unchanged.
 
     A newer schema is present after a rollback of an update. Releases only add to the schema (README), so this release
     works with a newer one. `before` is called with the present revision before the migration of existing tables; an
-    exception of `before` cancels the migration.
+    exception of `before` cancels the migration. `migrations`: folder of the migrations. StoreError for tables of a
+    version before the first release.
     """
-    config = migration_config()
+    config = Config()
+    config.set_main_option("script_location", str(migrations).replace("%", "%%"))
     scripts = ScriptDirectory.from_config(config)
     known = {script.revision for script in scripts.walk_revisions()}
     with engine.connect() as connection:
         present = set(MigrationContext.configure(connection).get_current_heads())
+    for version in present:
+        refuse_earlier_tables(version, str(folder_of(engine)))
     if not present <= known or present == set(scripts.get_heads()):
         return
     for version in present:
@@ -477,13 +479,6 @@ def schema_checksum(tables: Sequence[tuple[str, str | None]]) -> int:
     A bit that changes in the SQL of a trigger or a constraint passes SQLite's integrity check.
     """
     return zlib.crc32(repr(sorted(tables, key=repr)).encode()) & 0x7FFFFFFF or 1
-
-
-def migration_config() -> Config:
-    """Return Alembic's configuration, with the folder of the migrations in this package."""
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    return config
 
 
 def utc_text(moment: datetime) -> str:

@@ -20,6 +20,7 @@ from device.user_files import files_in
 from device.values import EYES
 from services.errors import RecordNotFound, StoreDamaged
 from services.records.dose_ledger_log import DoseLedgerLog, raise_to
+from services.records.earlier_stores import refuse_earlier_store
 
 KEPT_VERSIONS = 3
 LOG_SUFFIXES = ("journal", "wal", "shm")  # SQLite would apply a leftover log to the restored database
@@ -65,14 +66,16 @@ class Snapshots:
         """Replace the database by a snapshot, but for its doses; return the folder that holds the replaced files.
 
         Errors: RecordNotFound (unknown name), StoreDamaged (the snapshot fails the integrity check), StoreError
-        (another process uses the database), OSError. After a power cut during the replacement the store may refuse to
-        open, or rebuild its tables from the files of the records; a second restoration repairs it.
+        (another process uses the database, or the snapshot is of a version before the first release), OSError. After a
+        power cut during the replacement the store may refuse to open, or rebuild its tables from the files of the
+        records; a second restoration repairs it.
         """
         if name not in self.names():
             raise RecordNotFound(f"there is no snapshot {name!r}", "`diffuscope snapshots list` names them.")
         _refuse_damaged(self.folder / name)
+        refuse_earlier_store(self.folder / name, f"the snapshot {name}")
         refuse_in_use(self.database)
-        new = self.database.with_name(".shelf.part")
+        new = self.database.with_name(".store.part")
         new.unlink(missing_ok=True)  # left by an interrupted restoration
         atomic_io.write_file(new, (self.folder / name).read_bytes())
         carry_dose(self.database, new)
@@ -135,8 +138,8 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
 def carry_dose(replaced: Path, restored: Path) -> None:
     """Raise the doses in the restored tables to those in the replaced ones and in the second copy of the ledger.
 
-    Also an earlier release, which does not read the copy, then counts every dose. A replaced database that cannot be
-    read has its doses in the copy.
+    A replaced database that cannot be read has its doses in the copy; a restored one without tables is rebuilt from the
+    files, and then gets the doses of the copy.
     """
     state = DoseLedgerLog(replaced.parent).newest() or DoseLedgerState()
     if replaced.exists():
@@ -144,22 +147,27 @@ def carry_dose(replaced: Path, restored: Path) -> None:
             raise_to(state, _ledger_in(tables))
     with _connected(restored) as tables:
         tables.execute("PRAGMA journal_mode = DELETE")
-        if "light_time" not in {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}:
+        if "observed_time" not in {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}:
             return
         raise_to(state, _ledger_in(tables))
         tables.execute("BEGIN IMMEDIATE")
-        for (eye, slot), dose_j_per_cm2 in state.doses.items():
-            tables.execute("INSERT OR REPLACE INTO light_doses VALUES (?, ?, ?)", (eye, slot, dose_j_per_cm2))
-        time = (1, state.boot, state.now_s, state.observed_s)
-        tables.execute("INSERT OR REPLACE INTO light_time VALUES (?, ?, ?, ?)", time)
+        for (eye, interval), dose_j_per_cm2 in state.doses.items():
+            tables.execute(
+                "INSERT OR REPLACE INTO doses (eye, interval, dose_j_per_cm2) VALUES (?, ?, ?)",
+                (eye, interval, dose_j_per_cm2),
+            )
+        tables.execute(
+            "INSERT OR REPLACE INTO observed_time (id, boot, now_s, observed_s) VALUES (1, ?, ?, ?)",
+            (state.boot, state.now_s, state.observed_s),
+        )
         tables.execute("COMMIT")
 
 
 def _ledger_in(tables: sqlite3.Connection) -> DoseLedgerState:
     """Return the dose ledger in a database; sqlite3.DatabaseError if it has none."""
-    rows = tables.execute("SELECT eye, slot, dose_j_per_cm2 FROM light_doses").fetchall()
-    time = tables.execute("SELECT observed_s, boot, now_s FROM light_time").fetchone() or (0.0, "", 0.0)
-    return DoseLedgerState({(eye, slot): dose for eye, slot, dose in rows if eye in EYES}, *time)
+    rows = tables.execute("SELECT eye, interval, dose_j_per_cm2 FROM doses").fetchall()
+    time = tables.execute("SELECT observed_s, boot, now_s FROM observed_time").fetchone() or (0.0, "", 0.0)
+    return DoseLedgerState({(eye, interval): dose for eye, interval, dose in rows if eye in EYES}, *time)
 
 
 def _number(tables: sqlite3.Connection, pragma: str) -> int:

@@ -16,6 +16,7 @@ from device.user_files import files_in
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import blobs, record_signing, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles
 from services.records.recovery import damage_of
@@ -44,10 +45,11 @@ class Checked:
 def check_store(folder: Path, progress: Progress) -> list[Checked]:
     """Check the store in `folder` and return a result for each kind of content; `progress` gets one line per kind.
 
-    RecordNotFound if the folder holds no store; StoreError if the disk refuses.
+    RecordNotFound if the folder holds no store; StoreError if the disk refuses, or for an earlier store.
     """
     if not (folder / "captures").is_dir():
         raise RecordNotFound(f"{folder} holds no captures", "Give the folder of the captures with --data.")
+    refuse_earlier_store(folder / schema.DATABASE)
     with storage_errors():
         progress("reading the database")
         database = _checked_database(folder)
@@ -118,7 +120,7 @@ def _records_in_rows(folder: Path, kind: Kind) -> Iterator[tuple[str, RecordDocu
                 whole = {one.key: one for one in record_signing.documents_of(session, kind, page)}
                 for row in record_signing.rows_of(session, kind, page):
                     document = whole.get(schema.record_key(row))
-                    yield row.patient_id or row.number if isinstance(row, schema.PatientRow) else row.id, document
+                    yield row.patient_id if isinstance(row, schema.PatientRow) else row.id, document
                 session.expire_all()
     finally:
         engine.dispose()

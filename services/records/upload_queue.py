@@ -1,7 +1,7 @@
 """Upload queue: the finished visits whose last finished state the receiver has not confirmed.
 
 The queue is a query on the visits: a finish adds a visit, an undo of the finish removes it, and a second finish adds it
-again. The table `sendings` stores only the results of the upload attempts. The queue deletes no rows.
+again. The table `uploads` stores only the results of the upload attempts. The queue deletes no rows.
 """
 
 from collections.abc import Collection, Sequence
@@ -23,7 +23,7 @@ from services.records.storage_errors import storage_errors
 
 STUCK_AFTER = timedelta(days=3)  # an unreachable receiver needs no attention before
 UPLOADED_FILES = ("picture.png", COLOUR, "report.json")  # uploaded files of each capture
-# Same expression as the partial index `visits_to_send`, so that SQLite uses it.
+# Same expression as the partial index `visits_to_upload`, so that SQLite uses it.
 UNSENT = and_(VisitRow.finished_at.is_not(None), or_(VisitRow.sent.is_(None), VisitRow.sent != VisitRow.finished_at))
 SAME_FINISH = and_(UploadRow.visit == VisitRow.id, UploadRow.finished_at == VisitRow.finished_at)
 
@@ -138,7 +138,7 @@ class UploadQueue:
         with storage_errors(), Session(schema.for_writing(self.engine)) as session, session.begin():
             for one in which:
                 row = _attempt_row(session, one)
-                row.tries, row.error, row.said = row.tries + 1, error.code, error.message
+                row.tries, row.error, row.message = row.tries + 1, error.code, error.message
                 row.failing_since = row.failing_since or now
 
     def record_success(self, one: QueuedVisit, receipt: UploadReceipt) -> None:
@@ -149,7 +149,7 @@ class UploadQueue:
         now, finish = self.clock.wall(), schema.utc_text(one.finished_at)
         with storage_errors(), recorded(self.engine) as session:
             row = _attempt_row(session, one)
-            row.tries, row.error, row.said, row.failing_since = row.tries + 1, None, None, None
+            row.tries, row.error, row.message, row.failing_since = row.tries + 1, None, None, None
             row.sent_at, row.sha256, row.confirmed = schema.utc_text(now), receipt.sha256, receipt.confirmed
             session.execute(update(VisitRow).where(VisitRow.id == one.visit).values(sent=finish))
 
@@ -160,23 +160,23 @@ class UploadQueue:
             query = query.where(UploadRow.visit == visit)
         with storage_errors(), Session(schema.for_writing(self.engine)) as session, session.begin():
             for row in session.scalars(query):
-                row.error = row.said = None
+                row.error = row.message = None
 
 
-def _waiting(visit: VisitRow, sending: UploadRow | None, stuck: bool | None) -> QueuedVisit:
-    """Return a queue entry from its rows (`sending` None: no attempt yet); StoreDamaged if a row cannot be read.
+def _waiting(visit: VisitRow, upload: UploadRow | None, stuck: bool | None) -> QueuedVisit:
+    """Return a queue entry from its rows (`upload` None: no attempt yet); StoreDamaged if a row cannot be read.
 
     StoreDamaged too if `finished_at` is not in the notation of `schema.utc_text`: it would never equal `sent`.
     """
     with reading_record(visit.id):
-        id, number = row_validation.text(visit.id), row_validation.text(visit.person)
+        id, number = row_validation.text(visit.id), row_validation.text(visit.patient)
         finished_at = row_validation.timestamp(visit.finished_at)
         row_validation.one_of(visit.finished_at, schema.utc_text(finished_at))
-        if sending is None:
+        if upload is None:
             return QueuedVisit(id, number, finished_at)
-        error, message = (None if one is None else row_validation.text(one) for one in (sending.error, sending.said))
-        since = _failing_since(sending.failing_since)
-        return QueuedVisit(id, number, finished_at, sending.tries, since, error, message, stuck=bool(stuck))
+        error, message = (None if one is None else row_validation.text(one) for one in (upload.error, upload.message))
+        since = _failing_since(upload.failing_since)
+        return QueuedVisit(id, number, finished_at, upload.tries, since, error, message, stuck=bool(stuck))
 
 
 def _failing_since(value: object) -> datetime | None:
@@ -185,7 +185,7 @@ def _failing_since(value: object) -> datetime | None:
 
 
 def _attempt_row(session: Session, one: QueuedVisit) -> UploadRow:
-    """Return the row of `sendings` of (visit, finish time); add one with 0 tries to the transaction if missing."""
+    """Return the row of `uploads` of (visit, finish time); add one with 0 tries to the transaction if missing."""
     finish = schema.utc_text(one.finished_at)
     row = session.get(UploadRow, (one.visit, finish))
     if row is None:

@@ -110,7 +110,7 @@ class VisitPictures:
         """Return the id of the capture that a press with this idempotency key made; None for a new key.
 
         IdempotencyKeyConflict if the key belongs to a press for another eye, visit or slot, or to a request of another
-        kind. The record of the capture holds eye, visit and slot, so keys of an earlier release are checked too.
+        kind. The record of the capture holds eye, visit and slot.
         """
         with storage_errors(), Session(self._engine) as session:
             capture = self._requests.find(session, key, PRESS_REQUEST)

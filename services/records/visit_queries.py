@@ -52,11 +52,11 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
 
     RecordNotFound if the visit is unknown, StoreDamaged if the answer cannot be read.
     """
-    person = visit_row(session, id).person
+    patient = visit_row(session, id).patient
     answer = session.get(AnswerRow, (id, "consent"))
     with reading_record(id):
         value = None if answer is None else row_validation.parsed_json(answer.value)
-        return person, None if value is None else row_validation.text(value)
+        return patient, None if value is None else row_validation.text(value)
 
 
 def find_rows(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
@@ -71,7 +71,7 @@ def find_rows(session: Session, limit: int, day: str | None, open: bool | None, 
     if open is not None:
         query = query.where(VisitRow.finished_at.is_(None) if open else VisitRow.finished_at.is_not(None))
     if digits:
-        query = query.where(func.instr(VisitRow.person, digits.upper()) > 0)
+        query = query.where(func.instr(VisitRow.patient, digits.upper()) > 0)
     return [row for row in session.scalars(query) if row is not None]
 
 
@@ -114,7 +114,7 @@ def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) 
             }
             return Visit(
                 row.id,
-                row.person,
+                row.patient,
                 _day(row.day),
                 row_validation.timestamp(row.begun_at),
                 answers,
@@ -152,7 +152,7 @@ def _checked_row(row: VisitRow) -> VisitRow:
     with reading_record(row.id):
         if not _ID.fullmatch(row_validation.text(row.id)):
             raise ValueError("no name of a visit")
-        row_validation.text(row.person)
+        row_validation.text(row.patient)
     return row
 
 
@@ -175,9 +175,9 @@ def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, s
         if field.visit in out:  # a damaged row may differ from the index
             out[field.visit][field.name] = field.value
     known: dict[str, dict[str, str]] = defaultdict(dict)
-    for one in session.scalars(select(IdentifierRow).where(IdentifierRow.person.in_({row.person for row in rows}))):
-        known[one.person][one.name] = one.value
-    return {row.id: out[row.id] | known[row.person] for row in rows}
+    for one in session.scalars(select(IdentifierRow).where(IdentifierRow.patient.in_({row.patient for row in rows}))):
+        known[one.patient][one.name] = one.value
+    return {row.id: out[row.id] | known[row.patient] for row in rows}
 
 
 def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[object, object]]]:

@@ -49,7 +49,7 @@ class VisitRepository:
             id = f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
             day = now.astimezone().date().isoformat()
             reference = self.requests.reference(key, request)
-            session.add(VisitRow(id=id, person=number_of_patient, day=day, begun_at=begun_at, request=reference))
+            session.add(VisitRow(id=id, patient=number_of_patient, day=day, begun_at=begun_at, request=reference))
             return id
 
         return self.get(self.requests.run_in_transaction(key, request, act))
@@ -96,12 +96,12 @@ class VisitRepository:
         value = answers.validate_answer(name, value)
 
         def act(session: Session) -> str:
-            person, now = visit_rows.unfinished_row(session, id).person, schema.utc_text(self.clock.wall())
+            patient, now = visit_rows.unfinished_row(session, id).patient, schema.utc_text(self.clock.wall())
             if name not in answers.IDENTIFIERS:  # null is an answer too: no drops were given
                 session.merge(AnswerRow(visit=id, name=name, value=json.dumps(value), set_at=now))
             elif value is not None:
-                session.merge(IdentifierRow(person=person, name=name, value=json.dumps(value)))
-            elif (known := session.get(IdentifierRow, (person, name))) is not None:
+                session.merge(IdentifierRow(patient=patient, name=name, value=json.dumps(value)))
+            elif (known := session.get(IdentifierRow, (patient, name))) is not None:
                 session.delete(known)
             return id
 
@@ -124,7 +124,7 @@ class VisitRepository:
         def act(session: Session) -> str:
             row = visit_queries.visit_row(session, id)
             if row.finished_at is not None and self._end_of_undo(datetime.fromisoformat(row.finished_at)) is None:
-                raise VisitFinished(f"{row.person} was finished on an earlier day")
+                raise VisitFinished(f"{row.patient} was finished on an earlier day")
             row.finished_at = row.outcome = None
             return id
 

@@ -15,7 +15,7 @@ def unfinished_row(session: Session, id: str) -> VisitRow:
     """Return the row of an unfinished visit; VisitFinished if it is finished, RecordNotFound if unknown."""
     row = visit_queries.visit_row(session, id)
     if row.finished_at is not None:
-        raise VisitFinished(f"{row.person} is finished")
+        raise VisitFinished(f"{row.patient} is finished")
     return row
 
 

@@ -86,12 +86,12 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
-LATER = (
+OPTIONAL = (
     "frames",
     "channels",
     "psf_cylinder",
     "refraction_scatter",
-)  # fields of `Report` that earlier releases did not write
+)  # fields of `Report` that a capture without them does not write
 FRAME: Mapping[str, JsonValue] = {
     "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
     "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
@@ -246,7 +246,7 @@ CAPTURE: Mapping[str, JsonValue] = {
     "confirmed": _typed("object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY),
     "device": _typed(
         "object",
-        "Origin of the capture; captures of earlier releases have none.",
+        "Origin of the capture; null where it is unknown.",
         properties={
             "uuid": _text("UUID of the device, made with its data folder."),
             "serial": _text("Serial number of its board."),
@@ -300,7 +300,7 @@ def report_schema() -> dict[str, JsonValue]:
         ),
         "type": "object",
         "properties": {**properties, **FILES, **CAPTURE},
-        "required": [one.name for one in fields(Report) if one.name not in LATER],
+        "required": [one.name for one in fields(Report) if one.name not in OPTIONAL],
     }
 
 

@@ -26,8 +26,10 @@ from services.instrument.calibration_monitor import (
     in_force_since,
     reported_refractions,
 )
+from services.records import schema
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
+from services.records.earlier_stores import refuse_earlier_store
 
 DARKS = 3
 
@@ -85,7 +87,8 @@ def table(found: CheckResult) -> str:
 
 
 def _load_captures(spec: InstrumentSpec, calibration_id: str, data: Path) -> list[Capture]:
-    if not (data / "shelf.sqlite").is_file():
+    refuse_earlier_store(data / schema.DATABASE)
+    if not (data / schema.DATABASE).is_file():
         return []
     with CaptureStore(data) as store:
         return list(captures_with_calibration(store, calibration_id, in_force_since(spec)))

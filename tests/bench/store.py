@@ -64,7 +64,7 @@ def kill_and_start(folder: Path, head: Path, kills: int) -> Path:
             process.send_signal(end)
             process.wait(60)
             presses.result()
-        logs_left += end == signal.SIGTERM and data.joinpath("shelf.sqlite-wal").exists()
+        logs_left += end == signal.SIGTERM and data.joinpath("store.sqlite-wal").exists()
     with server.running():
         lost += len(acknowledged - set(_every(server)))
     timing.head("ends of the instrument", "ends", "stored", "lost", "log left")
@@ -138,7 +138,7 @@ def _opening_s(place: Path) -> float:
 
 
 def _rebuilding_s(place: Path) -> float:
-    (place / "shelf.sqlite").unlink()
+    (place / "store.sqlite").unlink()
     return _opening_s(place)
 
 

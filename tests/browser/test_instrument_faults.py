@@ -172,7 +172,7 @@ def test_double_tap_makes_one_picture(open_page: Open, real: Real) -> None:
     assert len(real.rig.store.captures()) == before + 1
 
 
-HOSTILE = ["<img src=x onerror=alert(1)>", "'; DROP TABLE persons; --", "{{7*7}}", "\u202egnp.exe", "x" * 100]
+HOSTILE = ["<img src=x onerror=alert(1)>", "'; DROP TABLE patients; --", "{{7*7}}", "\u202egnp.exe", "x" * 100]
 
 
 def test_markup_in_form_fields_is_stored_as_text(open_page: Open, real: Real, complaints: Complaints) -> None:

@@ -161,7 +161,7 @@ class Stage:
 
     def add_journal(self) -> None:
         """Append the content of the journal of interrupted captures to the trace."""
-        notes = sorted((self.rig.store.folder / "underway").glob("*.json"))
+        notes = sorted((self.rig.store.folder / "journal").glob("*.json"))
         entries = [digested_json.decoded(path.read_bytes()) for path in notes]  # the digest depends on the id
         self.trace.add(journal=entries)
 
@@ -398,7 +398,7 @@ def play(stage: Stage, name: str) -> dict[str, Any]:
             "died": rig.died.is_set(),
             "lamp": "dark" if rig.world.illumination is None else "lit",
             "captures": [[one.id, one.eye, one.simulated, sorted(one.files)] for one in rig.store.captures()],
-            "underway": sorted(path.name for path in (rig.store.folder / "underway").iterdir()),
+            "journal": sorted(path.name for path in (rig.store.folder / "journal").iterdir()),
             "spent_j_per_cm2": {
                 eye: float(f"{rig.exam.head.light.ledger.spent_j_per_cm2(eye):.6g}") for eye in ("OD", "OS")
             },

@@ -8,9 +8,6 @@ kept/send.toml          settings of the upload
 kept/update/            the state of an update
 records/files.json      the content of all of these as read by the code
 records/schema.sql      the tables
-kept-r0006/data/        a data folder of an earlier release, with the schema in its name: captures of one frame
-kept-r0006-burst/data/  another one: captures of four frames in green
-records/files-r0006.json    its content as that release read it
 """
 
 import hashlib
@@ -18,7 +15,6 @@ import json
 import re
 import shutil
 import sqlite3
-import tomllib
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
@@ -36,7 +32,6 @@ from services.delivery.visit_json import visit_as_json
 from services.errors import PinWrong, ReceiverUnreachable
 from services.http.authentication import PinAuthenticator
 from services.instrument.accuracy_explorer import AccuracyExplorer
-from services.records import digested_json
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_report import report_as_json
 from services.records.capture_store import CaptureStore
@@ -53,9 +48,6 @@ from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, rig_builder, trac
 from tests.unit.test_archive import WHO, calibration
 
 KEPT = Path(__file__).parent / "kept"
-# Data folders of earlier releases, by schema.
-VERSIONS = ("r0004", "r0005", "r0006", "r0006-burst")
-EARLIER = {version: Path(__file__).parent / f"kept-{version}" / "data" for version in VERSIONS}
 SCHEMA = compare.RECORDS / "schema.sql"
 DAY_S = 86400.0
 NOON = datetime(2026, 3, 2, 12, tzinfo=UTC)
@@ -300,19 +292,8 @@ def digest(content: bytes) -> str:
 # Rewriting the content
 
 
-def contents(calibration: dict[str, bytes]) -> dict[str, object]:
-    """Return the files of a calibration, with its manifest parsed: earlier releases laid out the TOML differently."""
-    return {
-        name: tomllib.loads(content.partition(b"\n")[2].decode()) if name == "manifest.toml" else content
-        for name, content in calibration.items()
-    }
-
-
 def written_again(folder: Path, place: Path) -> dict[str, bool]:
-    """Return for each file that is a function of its content whether the present code writes the same bytes.
-
-    The manifest of a calibration and the journal, which had no digest, are compared by their content.
-    """
+    """Return for each file that is a function of its content whether the present code writes the same bytes."""
     clock = VirtualClock(LATER)
     archive, again = Archive(folder / "calibrations"), Archive(place / "again")
     id = archive.active_id()
@@ -326,13 +307,13 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
         name = folder_name(visit)
         zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
         lost = CaptureJournal(store).interrupted[0]
-        note = store.folder / "underway" / f"{lost.id}.json"
-        before = digested_json.decoded(note.read_bytes())
+        note = store.folder / "journal" / f"{lost.id}.json"
+        before = note.read_bytes()
         note.unlink()
         CaptureJournal(store).begin(lost, "0" * 16)
-        journal = before.items() <= digested_json.decoded(note.read_bytes()).items()  # this release adds entries
+        journal = before == note.read_bytes()
     return {
-        "calibration": contents(again.files(id)) == contents(archive.files(id)),
+        "calibration": again.files(id) == archive.files(id),
         "signed file": (place / "sent").read_bytes() == (folder / "sent.calibration").read_bytes(),
         "export": zip_bytes == (folder / "export.zip").read_bytes(),
         "journal of interrupted captures": journal,
@@ -347,7 +328,7 @@ def shape(folder: Path) -> dict[str, Any]:
     """Return names of files and rows of tables, with captures and visits numbered and without digests."""
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
     names = [name for name in names if not name.endswith((".lock", "-wal", "-shm"))]
-    with closing(sqlite3.connect(folder / "data" / "shelf.sqlite")) as tables:
+    with closing(sqlite3.connect(folder / "data" / "store.sqlite")) as tables:
         every = tables.execute("SELECT name FROM sqlite_schema WHERE type = 'table' ORDER BY name").fetchall()
         rows = {name: _rows(tables, name) for (name,) in every if not name.startswith("sqlite_")}
     return numbered({"tables": rows, "files": names})
@@ -383,7 +364,7 @@ def numbered(value: Any) -> Any:
 
 def schema(data: Path) -> str:
     """Return the statements of the tables and indices of a data folder, sorted, as text."""
-    with closing(sqlite3.connect(data / "shelf.sqlite")) as tables:
+    with closing(sqlite3.connect(data / "store.sqlite")) as tables:
         found = tables.execute("SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL ORDER BY type, name").fetchall()
     return "".join(f"{statement.strip()};\n\n" for (statement,) in found)
 

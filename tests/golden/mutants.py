@@ -287,7 +287,7 @@ MUTANTS: tuple[Mutant, ...] = (
     # Dose ledger
     Mutant(LEDGER, "if boot == self.boot:", "if True:", T_BOOK),
     Mutant(LEDGER, "self.left_s(key[1], window_s) <= 0]", "self.left_s(key[1], window_s) <= 2 * SLOT_S]", T_BOOK),
-    Mutant(LEDGER, "return (slot + 2) * SLOT_S", "return (slot + 3) * SLOT_S", T_BOOK),
+    Mutant(LEDGER, "return (interval + 2) * INTERVAL_S", "return (interval + 3) * INTERVAL_S", T_BOOK),
     Mutant(LEDGER, "self.doses.items() if whose == eye)", "self.doses.items())", T_BOOK),
     Mutant(
         LEDGER,
@@ -295,7 +295,7 @@ MUTANTS: tuple[Mutant, ...] = (
         "        for eye in eyes[:1]:\n            wait_s",
         T_BOOK,
     ),
-    Mutant(LEDGER, "        self.add(reserved.eyes, reserved.slot, dose_j_per_cm2)\n", "", T_BOOK),
+    Mutant(LEDGER, "        self.add(reserved.eyes, reserved.interval, dose_j_per_cm2)\n", "", T_BOOK),
     Mutant(LEDGER, "given_j_per_cm2 - reserved.dose_j_per_cm2)", "given_j_per_cm2)", T_BOOK),
     Mutant(LEDGER, "total = self.spent(eye) + dose_j_per_cm2\n", "total = self.spent(eye)\n", T_BOOK),
     Mutant(LEDGER, "DailyLightLimit if wait_s > LONGEST_REST_S", "DailyLightLimit if wait_s < LONGEST_REST_S", T_BOOK),
@@ -307,7 +307,7 @@ MUTANTS: tuple[Mutant, ...] = (
     # Records
     Mutant(SIGNING, "elif document.sha256() != row.record_sha256:", "elif False:", T_RECOVERY),
     Mutant(RECOVERY, "if signed and in_file.revision > in_rows.revision:", "if False:", T_RECOVERY),
-    Mutant(RECOVERY, "checksum not in (0,", "checksum == 0 and checksum not in (0,", T_RECOVERY),
+    Mutant(RECOVERY, "schema.schema_checksum(tables) if tables else 0", "checksum", T_RECOVERY),
     # Store
     Mutant(STORE, "if hashlib.sha256(content).hexdigest() != files[name]:", "if False:", T_RECORDS),
     Mutant(STORE, "            self._refuse_duplicate(part, kept)\n", "", T_RECORDS),

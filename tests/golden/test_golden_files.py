@@ -30,11 +30,3 @@ def test_the_present_code_writes_files_and_rows_of_the_same_shape(kept: Path, tm
     assert not difference, difference
     assert files.schema(tmp_path / "present" / "data") == files.SCHEMA.read_text(encoding="utf-8")
     assert files.schema(kept / "data") == files.SCHEMA.read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("version", files.EARLIER)
-def test_the_data_folder_of_an_earlier_release_is_read_as_by_that_release(version: str, tmp_path: Path) -> None:
-    data = Path(shutil.copytree(files.EARLIER[version], tmp_path / "data"))
-    difference = compare.difference(compare.read(f"files-{version}"), files.read_data(data))
-    assert not difference, difference
-    assert files.schema(data) == files.SCHEMA.read_text(encoding="utf-8")

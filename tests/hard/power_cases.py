@@ -11,22 +11,24 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from device import atomic_io
 from device.calibration.archive import Archive
 from device.clock import SystemClock, VirtualClock
 from device.errors import CalibrationMissing
 from device.values import Report
-from services.errors import RecordRemoved, StoreDamaged
+from services.errors import RecordRemoved
+from services.records import schema
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.recovery import rebuild_database
+from services.records.recovery_report import RecoveryReport
 from services.records.removed_captures import Removal
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
-from tests.earlier import RAW, Release, store_of_version
 from tests.hard.power_backup import back_up, judge_backup, judge_restored, restore, with_backup, with_new_device
 from tests.hard.power_fat import (
     FILES,
@@ -39,6 +41,7 @@ from tests.hard.power_fat import (
     with_choice,
     with_stick,
 )
+from tests.second_migration import FIRST, SECOND, migrate, with_second_migration
 from tests.unit.test_archive import WHO, calibration
 
 OLD, NEW = (replace(calibration(black_dn), dark_dn=None, bad=None) for black_dn in (64.25, 65.0))
@@ -70,16 +73,16 @@ class Case:
     fat: tuple[str, ...] = ()  # folders on FAT
 
 
-def shelf_with_one(folder: Path) -> None:
+def store_with_one(folder: Path) -> None:
     with CaptureStore(folder, reserve_bytes=0) as store:
         store.save(capture("before"), FILES)
 
 
-def shelf_with_ledger(folder: Path) -> None:
+def store_with_ledger(folder: Path) -> None:
     """A device that was used has a ledger; without one both eyes count as full."""
     with CaptureStore(folder, reserve_bytes=0) as store:
         DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, boot="boot")
-    shelf_with_one(folder)
+    store_with_one(folder)
 
 
 def keep(folder: Path, acknowledge: Callable[[str], None]) -> None:
@@ -185,42 +188,56 @@ def judge_calibration(folder: Path, acknowledged: list[str]) -> str:
     return "new" if NEW.id in kept else "old"
 
 
-def earlier_shelf(folder: Path) -> None:
-    store_of_version(folder / "data", "r0001")
-    Release(folder / "data", "r0001").write(1)
+def with_captures(folder: Path, *names: str) -> None:
+    for second, name in enumerate(names):
+        with CaptureStore(folder / "data", reserve_bytes=0) as store:
+            store.save(capture(name, second), FILES)
 
 
-def migrate(folder: Path, acknowledge: Callable[[str], None]) -> None:
-    with CaptureStore(folder / "data", reserve_bytes=0):
-        acknowledge("open")
+def in_tables(folder: Path) -> list[str] | None:
+    """Return the ids of the captures in the tables before any recovery; None without a database."""
+    database = folder / "data" / schema.DATABASE
+    if not database.exists():
+        return None
+    with closing(sqlite3.connect(database)) as tables:
+        return [id for (id,) in tables.execute("SELECT id FROM captures ORDER BY rowid")]
+
+
+def with_first_tables(folder: Path) -> None:
+    with_captures(folder, "c1")
+
+
+def migrate_tables(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    """Migrate as a later release with a made-up migration does."""
+    with TemporaryDirectory() as place:
+        migrate(folder / "data", with_second_migration(Path(place)), SystemClock())
+    acknowledge("open")
 
 
 def judge_migration(folder: Path, acknowledged: list[str]) -> str:
-    """The earlier release reads the tables at any time; every snapshot is complete; this release opens the store."""
+    """This release works on the tables at any time; each snapshot is complete; the later release ends its migration."""
     data = folder / "data"
-    snapshots = list(data.glob("snapshots/*.db"))
-    for path in snapshots:
-        connection = sqlite3.connect(path)
-        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-        assert connection.execute("SELECT version_num FROM alembic_version").fetchone() == ("r0001",)
-        assert connection.execute("SELECT id FROM captures").fetchall() == [("c1",)]
-        connection.close()
-    connection = sqlite3.connect(data / "shelf.sqlite")
-    (version,) = connection.execute("SELECT version_num FROM alembic_version").fetchone()
-    connection.close()
-    assert version == "r0001" or snapshots, "changed without a snapshot"
-    assert version != "r0001" or not acknowledged
-    assert Release(data, "r0001").read(1)[1][0][0] == "c1"
-    with CaptureStore(data, reserve_bytes=0) as store:
-        assert [one.id for one in store.captures()] == ["c1"]
-        assert store.read("c1", "raw.tiff") == RAW
+    for path in data.glob("snapshots/*.db"):
+        with closing(sqlite3.connect(path)) as tables:
+            assert tables.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+            assert tables.execute("SELECT version_num FROM alembic_version").fetchone() == (FIRST,)
+            assert tables.execute("SELECT id FROM captures").fetchall() == [("c1",)]
+    with closing(sqlite3.connect(data / schema.DATABASE)) as tables:
+        (version,) = tables.execute("SELECT version_num FROM alembic_version").fetchone()
+    assert version == FIRST or list(data.glob("snapshots/*.db")), "changed without a snapshot"
+    assert version == SECOND or not acknowledged
+    for _ in range(2):
+        with CaptureStore(data, reserve_bytes=0) as store:
+            assert (store.recovery, [one.id for one in store.captures()]) == (RecoveryReport(), ["c1"])
+            assert {name: store.read("c1", name) for name in FILES} == FILES
+        migrate_tables(folder, lambda word: None)
         assert len(list(data.glob("snapshots/*.db"))) == 1
-    return "old" if version == "r0001" else "new"
+    return "old" if version == FIRST else "new"
 
 
 def with_damaged_database(folder: Path) -> None:
-    shelf_with_one(folder)
-    (folder / "shelf.sqlite").write_bytes(b"damaged" * 1000)
+    store_with_one(folder)
+    (folder / "store.sqlite").write_bytes(b"damaged" * 1000)
 
 
 def rebuild(folder: Path, acknowledge: Callable[[str], None]) -> None:
@@ -232,7 +249,7 @@ def rebuild(folder: Path, acknowledge: Callable[[str], None]) -> None:
 def judge_rebuilt(folder: Path, acknowledged: list[str]) -> str:
     """The capture is there at any time, and the damaged database stays."""
     outcome = judge_kept_beside(folder, acknowledged or ["before"])
-    damaged = [path.read_bytes() for path in folder.glob("damaged/*/shelf.sqlite")]
+    damaged = [path.read_bytes() for path in folder.glob("damaged/*/store.sqlite")]
     assert b"damaged" * 1000 in damaged
     return outcome
 
@@ -262,15 +279,15 @@ def judge_removed(folder: Path, acknowledged: list[str]) -> str:
 
 
 def half_kept(folder: Path) -> None:
-    shelf_with_one(folder)
+    store_with_one(folder)
     (folder / "captures" / ".half.part").mkdir()
     (folder / "captures" / ".half.part" / "raw.tiff").write_bytes(FILES["raw.tiff"])
 
 
 def judge_swept(folder: Path, acknowledged: list[str]) -> str:
-    before = {path.name for path in (folder / "torn").iterdir()}
+    before = {path.name for path in (folder / "quarantine").iterdir()}
     with CaptureStore(folder, reserve_bytes=0) as store:
-        kept = [path.read_bytes() for path in (folder / "torn").glob("half*/raw.tiff")]
+        kept = [path.read_bytes() for path in (folder / "quarantine").glob("half*/raw.tiff")]
         assert kept
         assert set(kept) == {FILES["raw.tiff"]}
         assert [one.id for one in store.captures()] == ["before"]
@@ -278,13 +295,13 @@ def judge_swept(folder: Path, acknowledged: list[str]) -> str:
 
 
 def with_snapshot(folder: Path) -> None:
-    Release(store_of_version(folder / "data", "r0003"), "r0003").write(1)
-    snapshots(folder).create("r0003")
-    Release(folder / "data", "r0003").write(2)
+    with_captures(folder, "c1")
+    snapshots(folder).create(FIRST)
+    with_captures(folder, "c2")
 
 
 def snapshots(folder: Path) -> Snapshots:
-    return Snapshots(folder / "data" / "shelf.sqlite", VirtualClock())
+    return Snapshots(folder / "data" / schema.DATABASE, VirtualClock())
 
 
 def restore_snapshot(folder: Path, acknowledge: Callable[[str], None]) -> None:
@@ -293,18 +310,13 @@ def restore_snapshot(folder: Path, acknowledge: Callable[[str], None]) -> None:
 
 
 def judge_restored_snapshot(folder: Path, acknowledged: list[str]) -> str:
-    """In between the store refuses to open, and a second restoration repairs it."""
-    outcome = ""
-    try:
-        CaptureStore(folder / "data").close()
-    except StoreDamaged:
-        assert not acknowledged
-        restore_snapshot(folder, lambda word: None)
-        outcome = "refused"
-    with CaptureStore(folder / "data") as store:
-        listed = [one.id for one in store.captures()]
-    assert listed == ["c1"] or (listed == ["c2", "c1"] and not acknowledged)
-    return outcome or ("new" if listed == ["c1"] else "old")
+    """The tables are the present or the restored ones, or gone in between; the next opening shows all captures."""
+    found = in_tables(folder)
+    assert found == ["c1"] or not acknowledged
+    with CaptureStore(folder / "data", reserve_bytes=0) as store:
+        assert {one.id for one in store.captures()} == {"c1", "c2"}
+        assert [store.read(id, name) for id in ("c1", "c2") for name in FILES] == [*FILES.values()] * 2
+    return "gone" if found is None else "new" if found == ["c1"] else "old"
 
 
 # Negative controls: programs without fsync, whose losses the simulation must detect.
@@ -365,22 +377,22 @@ def opened(folder: Path, acknowledge: Callable[[str], None]) -> None:
 
 OLD_NEW = frozenset({"old", "new"})
 CASES = {
-    "a capture is kept": Case(shelf_with_one, keep, judge_kept_beside, frozenset({"old", "torn", "new"})),
+    "a capture is kept": Case(store_with_one, keep, judge_kept_beside, frozenset({"old", "torn", "new"})),
     "the first capture of a new device": Case(nothing, keep, judge_kept, frozenset({"old", "torn", "new"})),
-    "answers of a visit": Case(shelf_with_one, answer, judge_answers, OLD_NEW),
-    "the book of light": Case(shelf_with_ledger, reserve_dose, judge_light, OLD_NEW),
+    "answers of a visit": Case(store_with_one, answer, judge_answers, OLD_NEW),
+    "the dose ledger": Case(store_with_ledger, reserve_dose, judge_light, OLD_NEW),
     "a calibration is kept and taken back": Case(calibrated, recalibrate, judge_calibration, OLD_NEW),
     "a calibration is taken in": Case(with_exported_calibration, import_calibration, judge_calibration, OLD_NEW),
     "the first calibration": Case(nothing, first_calibration, judge_calibration, frozenset({"none", "new"})),
     "a slot is committed": Case(with_choice, commit, judge_choice, frozenset("AB"), ("chooser",)),
-    "tables are brought forward": Case(earlier_shelf, migrate, judge_migration, OLD_NEW),
+    "tables are migrated": Case(with_first_tables, migrate_tables, judge_migration, OLD_NEW),
     "a damaged database is rebuilt": Case(with_damaged_database, rebuild, judge_rebuilt, frozenset({"old"})),
     "pictures are removed and brought back": Case(
-        shelf_with_one, remove_and_undo, judge_removed, frozenset({"whole", "removed"})
+        store_with_one, remove_and_undo, judge_removed, frozenset({"whole", "removed"})
     ),
     "a torn capture is moved aside": Case(half_kept, opened, judge_swept, OLD_NEW),
     "a snapshot is put back": Case(
-        with_snapshot, restore_snapshot, judge_restored_snapshot, frozenset({"old", "refused", "new"})
+        with_snapshot, restore_snapshot, judge_restored_snapshot, frozenset({"old", "gone", "new"})
     ),
     "a visit goes onto a FAT stick": Case(
         with_stick, export, judge_export, frozenset({"old", "empty", "new"}), ("stick",)

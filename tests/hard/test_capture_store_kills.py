@@ -77,13 +77,13 @@ def judge(folder: Path, line: str) -> str:
         listed = [kept.id for kept in store.captures()]
         assert is_complete(store, "before"), line
         assert {path.name for path in (folder / "captures").iterdir()} == set(listed), line
-        torn = {path.name: path.read_bytes() for path in (folder / "torn").glob("new/*") if path.name != RECORD}
+        torn = {path.name: path.read_bytes() for path in (folder / "quarantine").glob("new/*") if path.name != RECORD}
         if "new" in listed:
             assert (is_complete(store, "new"), store.newly_quarantined, torn) == (True, (), {}), line
             return "kept"
         assert all(FILES[name].startswith(content) for name, content in torn.items()), line
         assert store.newly_quarantined in ((), ("new",)), line
-        assert (folder / "torn" / "new").exists() == bool(store.newly_quarantined), line
+        assert (folder / "quarantine" / "new").exists() == bool(store.newly_quarantined), line
         if folder.name.endswith("5"):  # the id can be used again; tested in every tenth store
             store.save(capture("new", 1), FILES)
             assert is_complete(store, "new"), line

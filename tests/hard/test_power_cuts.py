@@ -67,13 +67,13 @@ def test_a_power_cut_at_any_call_leaves_the_old_or_the_new_state_complete(name: 
 def content(folder: Path) -> tuple[object, ...]:
     """Return the files of a folder and the rows of its databases after recovery, for comparison across page layouts."""
     rows: list[object] = []
-    for path in sorted(folder.rglob("shelf.sqlite")):
+    for path in sorted(folder.rglob("store.sqlite")):
         with closing(sqlite3.connect(path)) as connection:
             try:
                 rows += [str(path.relative_to(folder)), *connection.iterdump()]
             except sqlite3.DatabaseError:  # of a case with a damaged database
                 rows.append(path.read_bytes())
     for path in sorted(folder.rglob("*")):
-        if not path.name.startswith("shelf.sqlite"):
+        if not path.name.startswith("store.sqlite"):
             rows += [str(path.relative_to(folder)), path.is_file() and path.read_bytes()]
     return tuple(rows)

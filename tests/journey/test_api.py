@@ -190,7 +190,7 @@ def test_unknown_capture_is_404(old_rig: Any, path: str) -> None:
 def test_unknown_file_is_404_and_invalid_file_name_is_422(old_rig: Any) -> None:
     stored = old_rig.exam.press("OD").result(30)
     refused(old_rig.request("GET", f"/api/captures/{stored.id}/other.png"), 404, "store.unknown")
-    for name in ("shelf.sqlite", "..%5c..%5cpasswd", "RAW.TIFF", "raw.tiff.bak"):
+    for name in ("store.sqlite", "..%5c..%5cpasswd", "RAW.TIFF", "raw.tiff.bak"):
         refused(old_rig.request("GET", f"/api/captures/{stored.id}/{name}"), 422, "input")
 
 

@@ -127,3 +127,20 @@ def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
                 stream.read()  # a truncated chunked body would raise
     assert "Traceback" not in server.output()
     assert "Cancel" not in server.output()  # the server's word when it waited for streams in vain
+
+
+def test_a_data_folder_of_a_version_before_the_first_release_is_refused_before_the_head_is_opened(
+    diffuscope: Diffuscope, tmp_path: Path
+) -> None:
+    """The head's camera is missing here: it would be the error if the head were opened first."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "shelf.sqlite").write_bytes(b"its tables")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    done = diffuscope("run", "--head", "hardware/heads/imx296.toml", "--port", port, "--data", tmp_path / "data")
+    assert done.returncode == 2
+    assert "was written by a version before the first release, which cannot be read here" in done.stderr
+    assert "Give another folder with --data" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["shelf.sqlite"]

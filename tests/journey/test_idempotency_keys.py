@@ -59,7 +59,6 @@ def test_an_idempotency_key_is_bound_while_its_capture_is_in_progress(rig: Any) 
 
 
 def test_a_moved_capture_keeps_its_idempotency_key(tmp_path: Any) -> None:
-    """A key stored by an earlier release, which wrote the same word for every press, is supported too."""
     clock = VirtualClock()
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)

@@ -49,7 +49,7 @@ class EndsAt:
 
 def written(store: Path) -> dict[str, bytes]:
     """Return the frames of the press in progress that count: those with a note."""
-    notes = sorted(store.glob("underway/*/*.tiff.json"))
+    notes = sorted(store.glob("journal/*/*.tiff.json"))
     return {note.stem: note.with_name(note.stem).read_bytes() for note in notes}
 
 
@@ -108,9 +108,9 @@ def test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key(
     build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path, last: int, lit: int, dark: bool
 ) -> None:
     before = interrupt(last)
-    (folder,) = [path for path in (tmp_path / "store" / "underway").iterdir() if path.is_dir()]
+    (folder,) = [path for path in (tmp_path / "store" / "journal").iterdir() if path.is_dir()]
     id = folder.name
-    if not dark:  # an earlier release took it last
+    if not dark:  # the disk lost it
         del before.frames["dark.tiff"]
         (folder / "dark.tiff.json").unlink()
     with ExitStack() as undo:
@@ -135,7 +135,7 @@ def test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key(
         for name, content in before.frames.items():
             assert rig.store.read(id, name) == content
         assert ("dark.tiff" in capture.files) is dark
-        assert list((rig.store.folder / "underway").iterdir()) == []
+        assert list((rig.store.folder / "journal").iterdir()) == []
         visit = rig.request("GET", f"/api/visits/{before.visit}").json()
         assert visit["slots"]["R-centre"]["captures"] == [id]
 
@@ -163,7 +163,7 @@ def test_frames_of_a_patient_who_has_declined_since_are_deleted(
             rig.exam.press("OD", KEY, before.target).result(60)
         assert rig.store.captures() == []
         assert rig.exam.capture_journal.interrupted == ()
-        assert list((rig.store.folder / "underway").iterdir()) == []
+        assert list((rig.store.folder / "journal").iterdir()) == []
 
 
 def test_frames_that_a_full_disk_refuses_wait_for_a_start_with_room(
@@ -204,7 +204,7 @@ def test_sigkill_between_frames_and_during_the_reconstruction(environment: dict[
         lit = [name for name in shorter.frames if name == "raw.tiff" or name[4:5].isdigit()]
         assert len(report["frames"]) == len(lit) < 4
         assert SHORTER.format(taken=len(lit), planned=4) in report["warnings"]
-        assert list((data / "underway").iterdir()) == []
+        assert list((data / "journal").iterdir()) == []
         whole = killed_press(server, process, data, "d" * 16, "raw-red.tiff")
         assert set(whole.frames) >= {"raw.tiff", "raw-1.tiff", "raw-2.tiff", "raw-3.tiff", "raw-red.tiff", "dark.tiff"}
     with server.running():
@@ -212,7 +212,7 @@ def test_sigkill_between_frames_and_during_the_reconstruction(environment: dict[
         assert len(report["frames"]) == 4
         assert WHOLE in report["warnings"]
         assert server.listed() == [whole.id, shorter.id]
-    assert list((data / "underway").iterdir()) == []
+    assert list((data / "journal").iterdir()) == []
 
 
 @dataclass
@@ -229,11 +229,11 @@ def killed_press(server: Server, process: subprocess.Popen[bytes], data: Path, k
     request = {"eye": "OD", "key": key}
     with ThreadPoolExecutor(1) as aside:
         pressed = aside.submit(server.ask, "POST", "/api/captures", request)
-        until(lambda: bool(list(data.glob(f"underway/*/{last}.json"))) or pressed.done(), 300)
+        until(lambda: bool(list(data.glob(f"journal/*/{last}.json"))) or pressed.done(), 300)
         process.send_signal(signal.SIGKILL)
         assert pressed.exception(60) is not None, "the kill came too late, so the test shows nothing"
     process.wait()
-    (id,) = [one.name for one in (data / "underway").iterdir() if one.is_dir()]
+    (id,) = [one.name for one in (data / "journal").iterdir() if one.is_dir()]
     assert not (data / "captures" / id).exists(), "the kill came too late, so the test shows nothing"
     return KilledPress(id, request, written(data))
 

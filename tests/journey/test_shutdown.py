@@ -27,10 +27,10 @@ def test_sigterm_and_sigint_exit_with_0_and_checkpoint_the_database(
         press = {"eye": "OD", "key": "1" * 16, "visit": visit, "slot": "R-centre"}
         kept = server.ask("POST", "/api/captures", press)["id"]
         assert stop(process, number) == 0, server.output()
-    assert sorted(path.name for path in data.glob("shelf.sqlite*")) == ["shelf.sqlite"]
-    with closing(sqlite3.connect(f"file:{data / 'shelf.sqlite'}?mode=ro&immutable=1", uri=True)) as tables:
+    assert sorted(path.name for path in data.glob("store.sqlite*")) == ["store.sqlite"]
+    with closing(sqlite3.connect(f"file:{data / 'store.sqlite'}?mode=ro&immutable=1", uri=True)) as tables:
         assert tables.execute("SELECT id FROM captures").fetchall() == [(kept,)]
-        assert tables.execute("SELECT visit FROM shots").fetchall() == [(visit,)]
+        assert tables.execute("SELECT visit FROM capture_slots").fetchall() == [(visit,)]
     with server.running():
         assert server.listed() == [kept]
         assert server.ask("GET", f"/api/visits/{visit}")["slots"]["R-centre"]["capture"] == kept

@@ -109,9 +109,9 @@ def target(rig: Rig, visit: str) -> CaptureTarget:
     return pictures.capture_target("OD", KEY, visit, "R-centre")
 
 
-def underway(rig: Rig) -> list[str]:
+def in_journal(rig: Rig) -> list[str]:
     """Return the names of the frames in the journal of captures in progress."""
-    return sorted(path.name for path in (rig.store.folder / "underway").glob("*/*.tiff"))
+    return sorted(path.name for path in (rig.store.folder / "journal").glob("*/*.tiff"))
 
 
 @pytest.mark.parametrize("lit", [True, False], ids=["in the light", "before the storage"])
@@ -128,14 +128,14 @@ def test_a_lock_that_begins_after_the_dose_only_delays_the_picture(
             assert other.has_lock
             assert isinstance(rig.exam.problem, StoreLocked)
             assert not pressed.done()
-            assert "raw-3.tiff" in underway(rig)
+            assert "raw-3.tiff" in in_journal(rig)
             other.unlock()
             kept = pressed.result(60)
         until(lambda: rig.exam.state == "aim")
         assert rig.exam.problem is None
         assert rig.store.captures() == [kept]
         assert {"raw.tiff", "raw-1.tiff", "raw-2.tiff", "raw-3.tiff"} <= set(kept.files)
-        assert list((rig.store.folder / "underway").iterdir()) == []
+        assert list((rig.store.folder / "journal").iterdir()) == []
         assert rig.request("GET", f"/api/visits/{visit}").json()["slots"]["R-centre"]["captures"] == [kept.id]
         assert rig.world.illumination is None
 
@@ -171,7 +171,7 @@ def test_a_picture_that_cannot_be_stored_is_made_at_the_next_start(
         refuse(rig, moment, visit)
         assert rig.store.captures() == []
         assert rig.exam.capture_journal.interrupted == (), "the page does not ask for it again"
-        frames = underway(rig)
+        frames = in_journal(rig)
         assert len(frames) >= 5
         assert rig.world.illumination is None
         spent_j_per_cm2 = rig.exam.head.light.ledger.spent_j_per_cm2("OD")
@@ -183,7 +183,7 @@ def test_a_picture_that_cannot_be_stored_is_made_at_the_next_start(
         assert WHOLE in kept.report.reconstruction.warnings
         assert rig.world.frames == 0, "nothing is exposed again"
         assert rig.exam.head.light.ledger.spent_j_per_cm2("OD") == pytest.approx(spent_j_per_cm2)
-        until(lambda: list((rig.store.folder / "underway").iterdir()) == [])
+        until(lambda: list((rig.store.folder / "journal").iterdir()) == [])
         assert rig.request("GET", f"/api/visits/{visit}").json()["slots"]["R-centre"]["captures"] == [kept.id]
 
 
@@ -193,4 +193,4 @@ def test_a_capture_whose_rows_can_never_be_written_leaves_no_frames(build: Calla
         wrong = CaptureTarget(write_rows=lambda session, _: session.execute(text("SELECT nothing FROM nowhere")))
         with pytest.raises(StoreError):
             rig.exam.press("OD", KEY, wrong).result(60)
-        until(lambda: list((rig.store.folder / "underway").iterdir()) == [])
+        until(lambda: list((rig.store.folder / "journal").iterdir()) == [])

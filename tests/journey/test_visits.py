@@ -19,7 +19,7 @@ JSON = {"Content-Type": "application/json"}
 keys = (f"{number:016x}" for number in count(1))
 HOSTILE = [
     "<script>alert(1)</script>",
-    "'; DROP TABLE persons; --",
+    "'; DROP TABLE patients; --",
     '"><img src=x onerror=alert(1)>',
     "../../etc/passwd",
     "{{7*7}}",

@@ -47,7 +47,7 @@ def flip(log: Path, random_source: random.Random) -> str:
     at, bit = random_source.randrange(len(content)), random_source.randrange(8)
     content[at] ^= 1 << bit
     log.write_bytes(content)
-    log.with_name("shelf.sqlite-shm").unlink(missing_ok=True)  # as after a power cut
+    log.with_name("store.sqlite-shm").unlink(missing_ok=True)  # as after a power cut
     return f"bit {bit} of byte {at}"
 
 
@@ -64,7 +64,7 @@ def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
 ) -> None:
     data, random_source = tmp_path / "data", random.Random(16)
     kept = captures_before_a_kill(Server(head_file, data, environment))
-    log = data / "shelf.sqlite-wal"
+    log = data / "store.sqlite-wal"
     assert log.stat().st_size > 0, "the log is empty, so the test shows nothing"
     spent = spent_of(shutil.copytree(data, tmp_path / "as-it-was"))
     adopted = 0
@@ -93,11 +93,11 @@ def spent_of(folder: Path) -> dict[str, float]:
 
 
 def test_health_counts_orphans_and_gives_a_remedy(head_file: Path, environment: dict[str, str], tmp_path: Path) -> None:
-    """The copy has captures/ and shelf.sqlite of a killed instrument; health counts the one without a record."""
+    """The copy has captures/ and store.sqlite of a killed instrument; health counts the one without a record."""
     server, data, copy = Server(head_file, tmp_path / "data", environment), tmp_path / "data", tmp_path / "copy"
     kept = captures_before_a_kill(server)
     shutil.copytree(data / "captures", copy / "captures")
-    shutil.copyfile(data / "shelf.sqlite", copy / "shelf.sqlite")
+    shutil.copyfile(data / "store.sqlite", copy / "store.sqlite")
     (copy / "captures" / kept[0] / RECORD).unlink()  # as a release before the record wrote it
     with Server(head_file, copy, environment).running():
         pass  # a start, and a kill
@@ -113,9 +113,9 @@ def test_health_counts_orphans_and_gives_a_remedy(head_file: Path, environment: 
     assert complete_captures(copy) == set(kept)
 
 
-@pytest.mark.parametrize("place", ["captures", "torn"])
+@pytest.mark.parametrize("place", ["captures", "quarantine"])
 def test_a_full_disk_deletes_incomplete_captures_only(tmp_path: Path, place: str) -> None:
-    """Complete captures that an earlier release moved to torn/ stay too."""
+    """Complete captures in quarantine, which had not got their name yet, stay too."""
 
     def free_bytes(folder: Path) -> int:
         return 120_000 - sum(path.stat().st_size for path in folder.rglob("*/*/*"))

@@ -409,7 +409,7 @@ class Run:
         self.done["stored"] += sum(future.done() and future.exception(0) is None for future in self.futures)
         self.done["resumed"] += sum(future.done() and future.exception(0) is None for future in self.resumed)
         left = sum(is_left_for_later(future) for future in (*self.lit, *self.resumed))
-        on_disk = len(list(store.folder.glob("underway/*/raw.tiff.json")))
+        on_disk = len(list(store.folder.glob("journal/*/raw.tiff.json")))
         self._require(on_disk == left, f"{on_disk} presses have frames on the disk, and {left} were left for later")
 
     def _check_stored(self, capture: Capture, store: CaptureStore) -> None:
@@ -417,7 +417,7 @@ class Run:
         raw, _ = read_raw_tiff(store.read(capture.id, "raw.tiff"))
         self._require(raw.shape == self.world.shape, "the raw frame of a capture cannot be read")
         self._require(capture.simulated, "a capture is not marked as simulated")
-        journal = store.folder / "underway" / f"{capture.id}.json"
+        journal = store.folder / "journal" / f"{capture.id}.json"
         self._require(not journal.exists(), "a stored capture is still in the journal")
         self._require(not journal.with_suffix("").exists(), "frames of a stored capture are still in the journal")
 

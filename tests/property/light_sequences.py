@@ -452,7 +452,7 @@ class EyesWithDatabase(Eyes):
     def ledger(self) -> Ledger:
         if self.boots == 0 and not hasattr(self, "folder"):
             self.folder = self.cleanup.enter_context(TemporaryDirectory())
-        engine = schema.open_engine(f"{self.folder}/shelf.sqlite")
+        engine = schema.open_engine(f"{self.folder}/store.sqlite")
         self.cleanup.callback(engine.dispose)
         schema.migrate(engine, lambda _: None)
         return DoseLedgerStore(engine, self.times, DAY_S, boot=str(self.boots))

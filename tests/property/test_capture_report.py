@@ -4,7 +4,7 @@ import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from pathlib import Path
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from device.values import Report
-from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
+from services.records.capture import Capture, CaptureReport, EyeConfirmation, EyeCorrection
 from services.records.capture_report import read_report, report_as_json
-from tests.earlier import store_of_version
+from services.records.capture_store import CaptureStore
 
 # Keys of the reports of each release on `main`, with a value as that release wrote it.
 SOLVER = {
@@ -195,14 +195,13 @@ def test_what_is_built_is_read_again(seconds: dict[str, float], rounds: int, tes
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[sqlite3.Connection]:
-    """Return a connection to migrated tables with one capture, which an earlier release wrote."""
-    folder: Path = store_of_version(tmp_path_factory.mktemp("columns"), "r0005")
-    with closing(sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)) as connection:
-        row = ("c", "OD", "2026-03-01T12:00:00.000000+00:00", 1, "00ff", "{}")
+    """Return a connection to the tables of a store with one capture."""
+    folder = tmp_path_factory.mktemp("columns")
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        taken = Capture("c", "OD", datetime(2026, 3, 1, tzinfo=UTC), True, "00ff", CaptureReport(), {})
+        store.save(taken, {"raw.tiff": b"raw"})
+    with closing(sqlite3.connect(folder / "store.sqlite", isolation_level=None)) as connection:
         connection.execute("BEGIN")
-        connection.execute(
-            "INSERT INTO captures (id, eye, taken_at, simulated, calibration_id, report) VALUES (?, ?, ?, ?, ?, ?)", row
-        )
         yield connection
 
 

@@ -95,7 +95,7 @@ def test_every_file_of_the_store_is_restored_bit_for_bit(
     def files(folder: Path) -> dict[str, tuple[bytes, int]]:
         paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
         found = {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mode) for path in paths}
-        return {name: one for name, one in found.items() if not name.startswith(("shelf.sqlite", ".lock", "snapshots"))}
+        return {name: one for name, one in found.items() if not name.startswith(("store.sqlite", ".lock", "snapshots"))}
 
     assert files(tmp_path / "new") == files(store) | {"backup.json": files(tmp_path / "new")["backup.json"]}
     assert read_key(tmp_path / "new") == key
@@ -332,7 +332,7 @@ def test_a_capture_that_is_removed_during_a_backup_is_no_loss(
     def removing(done: int, _: int) -> None:
         if done == 1 and (store / removed).exists():
             shutil.rmtree(store / removed)
-            with closing(sqlite3.connect(store / "shelf.sqlite", isolation_level=None)) as tables:
+            with closing(sqlite3.connect(store / "store.sqlite", isolation_level=None)) as tables:
                 tables.execute("DELETE FROM files WHERE capture_id = 'test'")
                 tables.execute("DELETE FROM captures WHERE id = 'test'")
 
@@ -353,12 +353,12 @@ def test_a_file_that_the_disk_does_not_return_costs_its_folder_only(
 
 
 def test_a_damaged_database_is_not_backed_up(store: Path, stick: Path, key: BackupKey) -> None:
-    database = store / "shelf.sqlite"
+    database = store / "store.sqlite"
     shown(store)
     content = bytearray(database.read_bytes())
     content[4096 * 3 : 4096 * 5] = bytes(8192)
     database.write_bytes(content)
-    with pytest.raises(StoreDamaged, match=r"shelf\.sqlite|malformed|refused"):
+    with pytest.raises(StoreDamaged, match=r"store\.sqlite|malformed|refused"):
         write_backup(store, stick, CLOCK, quiet, key)
     assert not list(stick.rglob("backups/*.age"))
 

@@ -26,7 +26,7 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
 
 
 def test_a_stored_capture_is_not_interrupted_and_a_damaged_entry_still_gives_its_eye(store: CaptureStore) -> None:
-    folder = store.folder / "underway"
+    folder = store.folder / "journal"
     CaptureJournal(store).begin(InterruptedCapture("20260301T120000-OS-ab", "OS", "v", "L-nerve", 1))
     (folder / "20260301T120001-OD-cd.json").write_bytes(b"{half")
     kept = Capture("20260301T120002-OD-ef", "OD", datetime(2026, 3, 1, tzinfo=UTC), True, "00ff", CaptureReport(), {})
@@ -80,7 +80,7 @@ def test_an_interrupted_press_with_a_lit_frame_is_resumable_with_its_key_and_pla
     assert [frame.file.path.name for frame in one.frames] == ["raw.tiff", "raw-1.tiff"]
     found.end(PRESS.id)
     assert found.resumable == ()
-    assert list((store.folder / "underway").iterdir()) == []
+    assert list((store.folder / "journal").iterdir()) == []
 
 
 @pytest.mark.parametrize("lights", [(), ("dark",), ("red", "dark")])
@@ -90,18 +90,18 @@ def test_without_a_lit_frame_a_press_is_interrupted_and_its_frames_are_deleted(
     press_with_frames(store, lights=lights)
     found = CaptureJournal(store)
     assert (found.interrupted, found.resumable) == ((PRESS,), ())
-    assert [path.name for path in (store.folder / "underway").iterdir()] == [f"{PRESS.id}.json"]
+    assert [path.name for path in (store.folder / "journal").iterdir()] == [f"{PRESS.id}.json"]
 
 
 def test_frames_of_a_stored_capture_and_frames_without_an_entry_are_deleted_at_the_opening(store: CaptureStore) -> None:
     press_with_frames(store)
     press_with_frames(store, InterruptedCapture("20260301T120000-OD-cd", "OD"))
     store.save(Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {"raw.tiff": b"1"})
-    (store.folder / "underway" / "20260301T120000-OD-cd.json").unlink()
+    (store.folder / "journal" / "20260301T120000-OD-cd.json").unlink()
     for _ in range(2):
         found = CaptureJournal(store)
         assert (found.interrupted, found.resumable) == ((), ())
-        assert list((store.folder / "underway").iterdir()) == []
+        assert list((store.folder / "journal").iterdir()) == []
 
 
 def test_a_failed_resumption_is_an_interrupted_capture_and_two_lost_attempts_end_it(store: CaptureStore) -> None:
@@ -122,11 +122,11 @@ def test_a_failed_resumption_is_an_interrupted_capture_and_two_lost_attempts_end
 @pytest.mark.parametrize("entry", [b"{half", b'{"id": "a", "eye": "OD", "visit": null, "slot": null, "tries": 0}'])
 def test_frames_of_an_entry_that_does_not_name_its_target_are_not_resumed(store: CaptureStore, entry: bytes) -> None:
     press_with_frames(store)
-    (store.folder / "underway" / f"{PRESS.id}.json").write_bytes(entry)
+    (store.folder / "journal" / f"{PRESS.id}.json").write_bytes(entry)
     found = CaptureJournal(store)
     assert found.resumable == ()
     assert [(one.id, one.eye, one.visit) for one in found.interrupted] == [(PRESS.id, "OD", None)]
-    assert not (store.folder / "underway" / PRESS.id).exists()
+    assert not (store.folder / "journal" / PRESS.id).exists()
 
 
 def test_files_of_the_writer_are_linked_into_the_capture_and_outlast_the_journal(store: CaptureStore) -> None:

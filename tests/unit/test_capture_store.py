@@ -44,7 +44,7 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
 
 
 def database(folder: Path) -> sqlite3.Connection:
-    return sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)
+    return sqlite3.connect(folder / "store.sqlite", isolation_level=None)
 
 
 def test_a_stored_capture_is_equal_after_a_restart(store: CaptureStore) -> None:
@@ -108,7 +108,7 @@ def test_a_list_needs_a_positive_limit_and_a_known_start(store: CaptureStore) ->
         store.captures(before="never")
 
 
-@pytest.mark.parametrize("id", ["never", "", "../shelf.sqlite", "a/b", "\0", "\ud800", "x" * 300])
+@pytest.mark.parametrize("id", ["never", "", "../store.sqlite", "a/b", "\0", "\ud800", "x" * 300])
 def test_an_unknown_id_is_not_kept(store: CaptureStore, id: str) -> None:
     with pytest.raises(RecordNotFound):
         store.get(id)
@@ -181,7 +181,7 @@ def test_an_incomplete_capture_is_quarantined_and_overwrites_no_other(store: Cap
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.newly_quarantined == ("torn", "renamed", "torn-2")
         assert [kept.id for kept in again.captures()] == ["kept"]
-        found = {path.parent.name: path.read_bytes() for path in (store.folder / "torn").glob("*/*")}
+        found = {path.parent.name: path.read_bytes() for path in (store.folder / "quarantine").glob("*/*")}
         assert found == {"torn": b".torn.part", "torn-2": b"torn", "renamed": b"renamed"}
         assert again.read("kept", "raw.tiff") == FILES["raw.tiff"]
     with CaptureStore(store.folder) as once_more:
@@ -199,7 +199,7 @@ def test_a_complete_capture_that_was_not_renamed_is_quarantined_and_listed_as_or
         assert again.newly_quarantined == ("whole",)
         assert again.quarantine.orphans() == ["whole"]
         assert again.quarantine.sizes_bytes() == {}
-        assert {path.name for path in (store.folder / "torn" / "whole").iterdir()} == REQUIRED_FILES
+        assert {path.name for path in (store.folder / "quarantine" / "whole").iterdir()} == REQUIRED_FILES
 
 
 @pytest.mark.parametrize("leave", ["nothing", "an empty file"])
@@ -207,9 +207,9 @@ def test_a_missing_database_of_a_store_without_files_of_visits_is_an_error(store
     store.save(capture(), FILES)
     store.close()
     (store.folder / "visits").rmdir()
-    (store.folder / "shelf.sqlite").unlink()
+    (store.folder / "store.sqlite").unlink()
     if leave == "an empty file":
-        (store.folder / "shelf.sqlite").touch()
+        (store.folder / "store.sqlite").touch()
     with pytest.raises(StoreDamaged, match="is gone"):
         CaptureStore(store.folder)
     assert (store.folder / "captures" / capture().id / "raw.tiff").exists()
@@ -218,7 +218,7 @@ def test_a_missing_database_of_a_store_without_files_of_visits_is_an_error(store
 def test_a_file_that_is_no_database_is_an_error_without_files_of_visits(store: CaptureStore) -> None:
     store.close()
     (store.folder / "visits").rmdir()
-    (store.folder / "shelf.sqlite").write_bytes(b"not a database at all" * 1000)
+    (store.folder / "store.sqlite").write_bytes(b"not a database at all" * 1000)
     with pytest.raises(StoreDamaged, match="not a database"):
         CaptureStore(store.folder)
 
@@ -253,8 +253,8 @@ def test_quarantined_captures_are_deleted_oldest_first_when_a_new_one_needs_spac
 
     with CaptureStore(tmp_path, reserve_bytes=0, free_bytes=free_bytes) as store:
         for name in quarantined:
-            (tmp_path / "torn" / name).mkdir()
-            (tmp_path / "torn" / name / "raw.tiff").write_bytes(bytes(size_bytes))
+            (tmp_path / "quarantine" / name).mkdir()
+            (tmp_path / "quarantine" / name / "raw.tiff").write_bytes(bytes(size_bytes))
         assert store.quarantine.sizes_bytes() == dict.fromkeys(quarantined, size_bytes)
         store.save(capture("new"), {"raw.tiff": bytes(1_000)})
         assert list(store.quarantine.sizes_bytes()) == [*quarantined[1:]]
@@ -306,12 +306,12 @@ def test_a_press_without_free_files_is_refused_before_the_light(tmp_path: Path) 
 
 def test_a_press_without_free_files_deletes_quarantined_captures(tmp_path: Path) -> None:
     def free_files(_: Path) -> float:
-        return 60 - sum(1 for _ in tmp_path.rglob("torn/*/*"))
+        return 60 - sum(1 for _ in tmp_path.rglob("quarantine/*/*"))
 
     with CaptureStore(tmp_path, reserve_bytes=0, free_files=free_files) as store:
-        (tmp_path / "torn/20260301T120000-OD-aa").mkdir()
+        (tmp_path / "quarantine/20260301T120000-OD-aa").mkdir()
         for number in range(50):
-            (tmp_path / f"torn/20260301T120000-OD-aa/{number}").touch()
+            (tmp_path / f"quarantine/20260301T120000-OD-aa/{number}").touch()
         store.refuse_light_in_vain()
         assert store.quarantine.sizes_bytes() == {}
 
@@ -351,7 +351,7 @@ def test_an_opening_does_not_quarantine_a_capture_that_is_being_written(store: C
 
 
 def test_every_connection_is_durable_and_the_tables_are_strict(store: CaptureStore) -> None:
-    engine = schema.open_engine(store.folder / "shelf.sqlite")
+    engine = schema.open_engine(store.folder / "store.sqlite")
     with engine.connect() as one, engine.connect() as two:
         for connection in (one, two):
             for pragma, value in {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}.items():
@@ -369,7 +369,7 @@ TABLES_AND_INDEXES = (
 
 
 def test_the_migrations_create_the_schema_of_the_models(store: CaptureStore) -> None:
-    engine = schema.open_engine(store.folder / "shelf.sqlite")
+    engine = schema.open_engine(store.folder / "store.sqlite")
     with engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), schema.Base.metadata) == []
         made = set(connection.exec_driver_sql(TABLES_AND_INDEXES).scalars())
@@ -391,7 +391,7 @@ def test_tables_of_a_newer_schema_stay_unchanged(store: CaptureStore) -> None:
     store.save(capture(), FILES)
     store.close()
     connection = database(store.folder)
-    connection.execute("UPDATE alembic_version SET version_num = 'r9999'")
+    connection.execute("UPDATE alembic_version SET version_num = 's9999'")
     connection.execute("ALTER TABLE captures ADD COLUMN added_later TEXT")
     checksum = schema.schema_checksum(connection.execute(schema.SCHEMA_TEXT).fetchall())
     connection.execute(f"PRAGMA user_version = {checksum}")
@@ -400,7 +400,7 @@ def test_tables_of_a_newer_schema_stay_unchanged(store: CaptureStore) -> None:
         assert older.read(capture().id, "raw.tiff") == FILES["raw.tiff"]
         older.save(capture("b"), FILES)
     connection = database(store.folder)
-    assert connection.execute("SELECT version_num FROM alembic_version").fetchall() == [("r9999",)]
+    assert connection.execute("SELECT version_num FROM alembic_version").fetchall() == [("s9999",)]
     connection.close()
 
 

@@ -28,7 +28,7 @@ def keep(store: CaptureStore, id: str) -> None:
 
 def in_main_file(store: CaptureStore, to: Path) -> list[str]:
     """Return the capture ids in a copy of the main database file without its WAL."""
-    to.write_bytes((store.folder / "shelf.sqlite").read_bytes())
+    to.write_bytes((store.folder / "store.sqlite").read_bytes())
     with closing(sqlite3.connect(f"file:{to}?mode=ro&immutable=1", uri=True)) as tables:
         return [id for (id,) in tables.execute("SELECT id FROM captures ORDER BY id")]
 
@@ -44,7 +44,7 @@ def test_close_and_reopening_after_a_kill_leave_an_empty_wal(store: CaptureStore
     keep(store, "b")
     store.close()
     assert in_main_file(store, tmp_path / "copy") == ["a", "b"]
-    assert not (store.folder / "shelf.sqlite-wal").exists()
+    assert not (store.folder / "store.sqlite-wal").exists()
 
 
 def test_the_wal_is_checkpointed_when_idle_or_on_request_and_never_during_a_press(
@@ -74,7 +74,7 @@ def test_the_wal_is_checkpointed_when_idle_or_on_request_and_never_during_a_pres
 
 def test_a_checkpoint_during_a_read_transaction_is_deferred_without_error(store: CaptureStore) -> None:
     keep(store, "a")
-    with closing(sqlite3.connect(store.folder / "shelf.sqlite", isolation_level=None)) as reader:
+    with closing(sqlite3.connect(store.folder / "store.sqlite", isolation_level=None)) as reader:
         reader.execute("BEGIN")
         reader.execute("SELECT id FROM captures").fetchall()
         keep(store, "b")
@@ -93,9 +93,9 @@ def test_deleted_rows_lower_no_dose(store: CaptureStore) -> None:
     first.settle(first.reserve(("OD",), 1.0, 10.0), 0.25)
     clock.sleep(3600)
     first.reserve(("OS",), 2.0, 10.0)
-    with closing(sqlite3.connect(store.folder / "shelf.sqlite", isolation_level=None)) as tables:
-        tables.execute("DELETE FROM light_doses")
-        tables.execute("DELETE FROM light_time")
+    with closing(sqlite3.connect(store.folder / "store.sqlite", isolation_level=None)) as tables:
+        tables.execute("DELETE FROM doses")
+        tables.execute("DELETE FROM observed_time")
     again = open_ledger(store, clock)
     assert (again.spent_j_per_cm2("OD"), again.spent_j_per_cm2("OS")) == (0.25, 2.0)
     clock.sleep(DAY_S)

@@ -41,16 +41,16 @@ REPORT = {
 TABLES = {
     "captures": ("id", "eye", "taken_at", "calibration_id", "report"),
     "files": ("capture_id", "name", "sha256"),
-    "visits": ("id", "person", "day", "begun_at", "finished_at", "outcome"),
-    "fields": ("visit", "name", "value"),
-    "identifiers": ("person", "name", "value"),
-    "shots": ("capture", "visit", "slot"),
-    "slots": ("visit", "slot", "capture"),
-    "sendings": ("visit", "finished_at", "failing_since", "error", "said"),
-    "persons": ("number",),
-    "light_time": ("boot",),
-    "light_doses": ("eye",),
-    "keys": ("key", "answer", "done_at"),
+    "visits": ("id", "patient", "day", "begun_at", "finished_at", "outcome"),
+    "answers": ("visit", "name", "value"),
+    "identifiers": ("patient", "name", "value"),
+    "capture_slots": ("capture", "visit", "slot"),
+    "slot_decisions": ("visit", "slot", "capture"),
+    "uploads": ("visit", "finished_at", "failing_since", "error", "message"),
+    "patients": ("number",),
+    "observed_time": ("boot",),
+    "doses": ("eye",),
+    "idempotency_keys": ("key", "answer", "done_at"),
 }
 TURNS = 4
 DISTINCT = 8  # length from which a text occurs in rows and indices only, not in the schema
@@ -99,7 +99,7 @@ def copied(filled: Path, to: Path) -> Path:
 
 def corrupt(folder: Path, table: str, column: str, random_source: random.Random) -> str:
     """Change one byte of a text of that column, in the row with its indices or at one place of the file."""
-    path = folder / "shelf.sqlite"
+    path = folder / "store.sqlite"
     with closing(database(folder)) as tables:
         tables.text_factory = bytes
         rows = tables.execute(f"SELECT rowid, {column} FROM {table} WHERE {column} IS NOT NULL").fetchall()
@@ -165,7 +165,7 @@ def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
 
 
 def database(folder: Path) -> sqlite3.Connection:
-    tables = sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)
+    tables = sqlite3.connect(folder / "store.sqlite", isolation_level=None)
     tables.execute("PRAGMA ignore_check_constraints = ON")
     return tables
 
@@ -195,7 +195,7 @@ def test_a_damaged_visit_is_refused_and_counted(store: CaptureStore) -> None:
     newest, middle, _ = people.visits(10)
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE visits SET outcome = CAST(x'7bff' AS TEXT) WHERE id = ?", (middle.id,))
-        tables.execute("UPDATE fields SET value = '[' WHERE visit = ?", (newest.id,))
+        tables.execute("UPDATE answers SET value = '[' WHERE visit = ?", (newest.id,))
     assert len(people.visits(10)) == 1
     assert people.damaged() == 2
     for visit in (newest, middle):

@@ -1,9 +1,6 @@
 """Second copy of the dose ledger: no damage of table or file lowers a dose that was counted."""
 
-import json
 import sqlite3
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,11 +13,11 @@ from hypothesis import strategies as st
 
 from device.clock import VirtualClock
 from device.errors import LightLimit, StoreError
-from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState
+from device.light_safety.dose_ledger import INTERVAL_S, DoseLedgerState
 from device.values import EYES, Eye
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
-from services.records.dose_ledger_log import EARLIER_BLOCK_BYTES, EARLIER_COPY, LOG, MAX_BYTES, DoseLedgerLog
+from services.records.dose_ledger_log import LOG, MAX_BYTES, DoseLedgerLog
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.snapshots import Snapshots
 
@@ -38,13 +35,13 @@ def ledger_of(store: CaptureStore, clock: VirtualClock) -> DoseLedgerStore:
 
 
 def run(folder: Path, *statements: str) -> None:
-    with closing(sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)) as tables:
+    with closing(sqlite3.connect(folder / "store.sqlite", isolation_level=None)) as tables:
         for statement in statements:
             tables.execute(statement)
 
 
 def lose_rows(folder: Path) -> None:
-    run(folder, "DELETE FROM light_doses", "DELETE FROM light_time")
+    run(folder, "DELETE FROM doses", "DELETE FROM observed_time")
 
 
 def lose_file(folder: Path) -> None:
@@ -136,7 +133,7 @@ def test_the_observed_time_survives_the_loss_of_the_file(store: CaptureStore) ->
     ledger.reserve(("OS",), 1.0, STOP)
     lose_file(store.folder)
     again = ledger_of(store, clock)
-    clock.sleep(DAY_S / 2 + 2 * SLOT_S)
+    clock.sleep(DAY_S / 2 + 2 * INTERVAL_S)
     assert (again.spent_j_per_cm2("OD"), again.spent_j_per_cm2("OS")) == (0.0, 1.0)
 
 
@@ -145,7 +142,7 @@ def test_a_change_that_the_database_refuses_counts_the_higher_dose(store: Captur
     ledger = ledger_of(store, clock)
     reserved = ledger.reserve(("OD",), 1.0, STOP)
     clock.sleep(1)
-    run(store.folder, "CREATE TRIGGER full BEFORE UPDATE ON light_time BEGIN SELECT RAISE(FAIL, 'no space'); END")
+    run(store.folder, "CREATE TRIGGER full BEFORE UPDATE ON observed_time BEGIN SELECT RAISE(FAIL, 'no space'); END")
     with pytest.raises(StoreError):
         ledger.settle(reserved, 0.25)
     run(store.folder, "DROP TRIGGER full")
@@ -175,8 +172,8 @@ def test_both_eyes_of_a_used_device_count_as_full_if_table_and_file_are_gone(sto
 def test_a_restored_snapshot_lowers_no_dose(store: CaptureStore) -> None:
     clock = VirtualClock()
     ledger = ledger_of(store, clock)
-    snapshots = Snapshots(store.folder / "shelf.sqlite", clock)
-    snapshots.create("r0001")
+    snapshots = Snapshots(store.folder / "store.sqlite", clock)
+    snapshots.create("s0001")
     ledger.settle(ledger.reserve(("OD",), 9.5, STOP), 9.5)
     store.close()
     snapshots.restore(snapshots.names()[0])
@@ -184,35 +181,9 @@ def test_a_restored_snapshot_lowers_no_dose(store: CaptureStore) -> None:
         ledger_of(restored, clock).reserve(("OD",), 1.0, STOP)
 
 
-def block_of_earlier_release(number: int, dose_j_per_cm2: float) -> bytes:
-    entry = {"number": number, "boot": "b", "now_s": 5.0, "observed_s": 7.0, "doses": [["OD", 0, dose_j_per_cm2]]}
-    content = json.dumps(entry).encode()
-    head = struct.pack("<II", len(content), zlib.crc32(content))
-    return (head + content).ljust(EARLIER_BLOCK_BYTES, b"\0")
-
-
-def test_the_copy_of_an_earlier_release_is_read(tmp_path: Path) -> None:
-    (tmp_path / EARLIER_COPY).write_bytes(block_of_earlier_release(2, 0.5) + block_of_earlier_release(3, 0.75))
-    assert DoseLedgerLog(tmp_path).newest() == DoseLedgerState({("OD", 0): 0.75}, 7.0, "b", 5.0)
-    (tmp_path / EARLIER_COPY).write_bytes(block_of_earlier_release(2, 0.5) + b"x" * EARLIER_BLOCK_BYTES)
-    assert DoseLedgerLog(tmp_path).newest() == DoseLedgerState({("OD", 0): 0.5}, 7.0, "b", 5.0)
-
-
-def test_an_outdated_copy_of_an_earlier_release_is_not_used_for_a_lost_ledger(store: CaptureStore) -> None:
-    clock = VirtualClock()
-    (store.folder / EARLIER_COPY).write_bytes(block_of_earlier_release(1, 0.0))
-    ledger = ledger_of(store, clock)
-    ledger.settle(ledger.reserve(("OD",), STOP, STOP), STOP)
-    store.save(Capture("a", "OD", clock.wall(), True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
-    lose_rows(store.folder)
-    lose_file(store.folder)
-    with pytest.raises(LightLimit):
-        ledger_of(store, clock).reserve(("OD",), 0.001, STOP)
-
-
 def test_the_file_does_not_grow_without_limit(tmp_path: Path) -> None:
     log = DoseLedgerLog(tmp_path)
-    state = DoseLedgerState({("OD", slot): 0.1 for slot in range(150)}, 7.0, "b", 5.0)
+    state = DoseLedgerState({("OD", interval): 0.1 for interval in range(150)}, 7.0, "b", 5.0)
     for number in range(200):
         state.now_s = float(number)
         log.append(state)

@@ -13,7 +13,7 @@ import pytest
 
 from device.clock import VirtualClock, boot_id
 from device.errors import DailyLightLimit, LightLimit, StoreError
-from device.light_safety.dose_ledger import SLOT_S, MemoryLedger
+from device.light_safety.dose_ledger import INTERVAL_S, MemoryLedger
 from device.light_safety.guard import AFTERGLOW_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
 from device.values import Illumination
@@ -63,9 +63,9 @@ def test_a_reservation_counts_until_it_is_settled_with_the_given_dose(store: Cap
 def test_a_dose_with_an_unreadable_eye_counts_for_both_eyes(store: CaptureStore, clock: VirtualClock) -> None:
     """Also without the second copy of the ledger, which would restore the dose."""
     open_ledger(store, clock).reserve(("OD",), STOP / 2, STOP)
-    with sqlite3.connect(store.folder / "shelf.sqlite") as tables:
+    with sqlite3.connect(store.folder / "store.sqlite") as tables:
         tables.execute("PRAGMA ignore_check_constraints = ON")  # as a flipped bit on the disk
-        tables.execute("UPDATE light_doses SET eye = 'O?'")
+        tables.execute("UPDATE doses SET eye = 'O?'")
     (store.folder / "dose-ledger.log").unlink()
     assert [open_ledger(store, clock).spent_j_per_cm2(eye) for eye in ("OD", "OS")] == [STOP / 2, STOP / 2]
 
@@ -75,7 +75,7 @@ def test_a_dose_expires_after_a_day_of_observed_time(store: CaptureStore, clock:
     ledger.settle(ledger.reserve(("OD",), STOP, STOP), STOP)
     clock.sleep(DAY_S)
     assert ledger.spent_j_per_cm2("OD") == STOP
-    clock.sleep(2 * SLOT_S)
+    clock.sleep(2 * INTERVAL_S)
     assert ledger.spent_j_per_cm2("OD") == 0
     ledger.reserve(("OD",), STOP, STOP)
 
@@ -85,7 +85,7 @@ def test_neither_the_date_nor_the_time_without_power_expires_a_dose(store: Captu
     later = VirtualClock(clock.start + timedelta(days=400))
     for boot in ("second", "third"):  # each boot observes half a day
         ledger = open_ledger(store, later, boot)
-        later.sleep(DAY_S / 2 + SLOT_S - 1)
+        later.sleep(DAY_S / 2 + INTERVAL_S - 1)
         with pytest.raises(LightLimit):
             ledger.reserve(("OD",), STOP, STOP)
     later.sleep(2)
@@ -101,7 +101,7 @@ def test_the_uptime_before_the_first_observation_expires_no_dose(store: CaptureS
 
 def test_a_new_process_of_the_same_boot_continues_the_observed_time(store: CaptureStore, clock: VirtualClock) -> None:
     open_ledger(store, clock).reserve(("OD",), STOP, STOP)
-    clock.sleep(DAY_S + 2 * SLOT_S)
+    clock.sleep(DAY_S + 2 * INTERVAL_S)
     assert open_ledger(store, clock).spent_j_per_cm2("OD") == 0
 
 
@@ -111,12 +111,12 @@ def test_a_refusal_gives_the_time_of_the_next_light(store: CaptureStore, durable
     ledger = open_ledger(store, clock) if durable else MemoryLedger(clock)
     ledger.reserve(("OD",), STOP, STOP)
     clock.sleep(3600)
-    then = (clock.start + timedelta(seconds=DAY_S + 2 * SLOT_S)).astimezone()
+    then = (clock.start + timedelta(seconds=DAY_S + 2 * INTERVAL_S)).astimezone()
     with pytest.raises(LightLimit, match=rf"the right eye .* again after {then:%H:%M on %Y-%m-%d}") as raised:
         ledger.reserve(("OS", "OD"), 0.001, STOP)
     assert "stay on" in raised.value.remedy
     assert ledger.spent_j_per_cm2("OS") == 0  # refused for one eye, counted for neither
-    clock.sleep(DAY_S + 2 * SLOT_S - 3600 - 1)
+    clock.sleep(DAY_S + 2 * INTERVAL_S - 3600 - 1)
     with pytest.raises(LightLimit):
         ledger.reserve(("OD",), 0.001, STOP)
     clock.sleep(1)
@@ -172,13 +172,13 @@ def test_at_the_limit_the_lamp_stays_dark_for_that_eye_only(store: CaptureStore,
 def test_no_light_without_a_writable_ledger(store: CaptureStore, clock: VirtualClock) -> None:
     lamp = Lamp()
     guarded = guard(lamp, clock, open_ledger(store, clock))
-    with sqlite3.connect(store.folder / "shelf.sqlite") as connection:
-        connection.execute("CREATE TRIGGER full BEFORE INSERT ON light_doses BEGIN SELECT RAISE(FAIL, 'full'); END")
-    with pytest.raises(StoreError, match="book of light") as raised, guarded.on(GREEN):
+    with sqlite3.connect(store.folder / "store.sqlite") as connection:
+        connection.execute("CREATE TRIGGER full BEFORE INSERT ON doses BEGIN SELECT RAISE(FAIL, 'full'); END")
+    with pytest.raises(StoreError, match="dose ledger cannot be written") as raised, guarded.on(GREEN):
         pytest.fail("light without a record")
     assert lamp.illumination is None
     assert "written down" in raised.value.remedy
-    with sqlite3.connect(store.folder / "shelf.sqlite") as connection:
+    with sqlite3.connect(store.folder / "store.sqlite") as connection:
         connection.execute("DROP TRIGGER full")
     connection.close()
     with guarded.on(GREEN):
@@ -190,9 +190,9 @@ def test_a_ledger_error_during_the_light_leaves_the_reservation_counted(
 ) -> None:
     lamp, ledger = Lamp(), open_ledger(store, clock)
     guarded = guard(lamp, clock, ledger)
-    connection = sqlite3.connect(store.folder / "shelf.sqlite")
+    connection = sqlite3.connect(store.folder / "store.sqlite")
     with guarded.on(GREEN, ("OD",)):
-        connection.execute("CREATE TRIGGER full BEFORE UPDATE ON light_doses BEGIN SELECT RAISE(FAIL, 'full'); END")
+        connection.execute("CREATE TRIGGER full BEFORE UPDATE ON doses BEGIN SELECT RAISE(FAIL, 'full'); END")
         connection.commit()
     assert lamp.illumination is None
     assert ledger.spent_j_per_cm2("OD") == pytest.approx(100e-6 * (10 + AFTERGLOW_S))

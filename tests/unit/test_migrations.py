@@ -1,18 +1,18 @@
-"""Migrations: each only adds, so that earlier releases work on later tables; snapshots and their restoration."""
+"""Migrations: each only adds, so that a rolled-back release works on later tables; snapshots and their restoration."""
 
 import ast
-import json
 import re
-import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from datetime import UTC, datetime
-from fnmatch import fnmatch
+from itertools import count
 from os.path import commonprefix
 from pathlib import Path
 
 import pytest
+from alembic import command
+from alembic.config import Config
 from alembic.script import ScriptDirectory
 from typer.testing import CliRunner
 
@@ -20,21 +20,20 @@ from device.clock import SystemClock, VirtualClock
 from device.errors import StoreError, StoreFull
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import schema
-from services.records.capture_report import read_verdict
+from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.command import app
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
+from services.records.recovery_report import RecoveryReport
 from services.records.snapshots import KEPT_VERSIONS, Snapshots
 from services.records.visit import SlotCapture
 from services.records.visit_repository import VisitRepository
-from tests.earlier import RAW, READS, WRITES, Release, store_of_version
-from tests.golden.files import EARLIER
-from tests.project_files import files, nodes, text
+from tests.project_files import nodes
+from tests.second_migration import FIRST, SECOND, migrate, with_second_migration
 
-VERSIONS = sorted(script.revision for script in ScriptDirectory.from_config(schema.migration_config()).walk_revisions())
-HEAD = VERSIONS[-1]
-MIGRATIONS = [name for name in files() if fnmatch(name, "services/records/migrations/versions/r*.py")]
+FILES = {"raw.tiff": b"raw counts"}
+KEYS = (f"{number:016x}" for number in count(1))
 CHANGES = ("DROP ", "RENAME ", "DELETE ", "UPDATE ", "TRIGGER ")
 # A trigger that only makes a digest null refuses nothing and changes no value that an older release reads or writes.
 FORGETS_DIGEST = re.compile(
@@ -44,54 +43,97 @@ FORGETS_DIGEST = re.compile(
 BINDS = ("CHECK", "UNIQUE", "REFERENCES", "PRIMARY KEY")
 
 
-@pytest.mark.parametrize("version", WRITES)
-def test_each_version_is_migrated_used_by_its_own_release_and_migrated_again(version: str, tmp_path: Path) -> None:
-    earlier = Release(store_of_version(tmp_path, version), version)
-    earlier.write(1)
-    first = earlier.read(1)
-    assert all(first[:3])
-    with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert_complete(store, version, [1])
-    assert earlier.read(1) == first
-    earlier.write(2)  # rolled back: the earlier release reads and writes
-    second = earlier.read(2)
-    with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert_complete(store, version, [1, 2])
-        assert store.newly_quarantined == ()
-    assert (earlier.read(1), earlier.read(2)) == (first, second)
-    assert version_of(tmp_path / "shelf.sqlite") == HEAD
+@pytest.fixture
+def migrations(tmp_path: Path) -> Path:
+    return with_second_migration(tmp_path)
 
 
-def assert_complete(store: CaptureStore, version: str, numbers: list[int]) -> None:
-    """Assert that this release reads all data of an earlier one."""
-    assert {one.id for one in store.captures()} == {f"c{n}" for n in numbers}
-    assert [store.read(f"c{n}", "raw.tiff") for n in numbers] == [RAW] * len(numbers)
-    if version >= "r0002":
-        ledger = DoseLedgerStore(store.engine, VirtualClock(elapsed_s=1.0), 86_400.0, boot="boot")
-        assert ledger.spent_j_per_cm2("OD") == sum(numbers)
-    if version >= "r0003":
-        visits = VisitRepository(store.engine, load_protocol(), SystemClock()).visits(10)
-        assert {(one.id, one.fields["age"]) for one in visits} == {(f"v{n}", 51) for n in numbers}
+def people(store: CaptureStore) -> VisitRepository:
+    return VisitRepository(store.engine, load_protocol(), VirtualClock())
 
 
-def test_every_version_of_the_tables_has_the_statements_of_its_release() -> None:
-    assert list(WRITES) == list(READS) == VERSIONS
+def use(folder: Path, number: int) -> None:
+    """Store a capture in a slot of a new visit, an answer, and a dose of `number` J/cm2, as this release does."""
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        ledger(store).reserve(("OD",), number, 10.0)
+        visits = people(store)
+        visit = visits.answer(next(KEYS), visits.begin(next(KEYS)).id, "consent", "agreed").id
+        target = visits.pictures.capture_target("OD", None, visit, "R-centre")
+        report = CaptureReport(visit=target.visit, slot=target.slot)
+        taken = Capture(f"c{number}", "OD", VirtualClock().wall(), True, "00ff", report, {})
+        store.save(taken, FILES, target.write_rows)
+
+
+def ledger(store: CaptureStore) -> DoseLedgerStore:
+    return DoseLedgerStore(store.engine, VirtualClock(elapsed_s=1.0), 86_400.0, boot="boot")
+
+
+def assert_complete(folder: Path, numbers: list[int]) -> None:
+    """Assert that this release reads all that was stored, and has nothing to recover."""
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        assert (store.recovery, store.newly_quarantined) == (RecoveryReport(), ())
+        assert {one.id for one in store.captures()} == {f"c{n}" for n in numbers}
+        assert [store.read(f"c{n}", "raw.tiff") for n in numbers] == [FILES["raw.tiff"]] * len(numbers)
+        assert ledger(store).spent_j_per_cm2("OD") == sum(numbers)
+        slots = [one.slots["R-centre"].captures for one in people(store).visits(10)]
+        assert sorted(one.capture for captures in slots for one in captures) == [f"c{n}" for n in numbers]
+
+
+def test_tables_are_copied_and_migrated_and_a_rolled_back_release_works_on_them(
+    tmp_path: Path, migrations: Path
+) -> None:
+    folder, clock = tmp_path / "store", VirtualClock(datetime(2026, 11, 21, tzinfo=UTC))
+    use(folder, 1)
+    assert not (folder / "snapshots").exists()
+    for _ in range(2):
+        migrate(folder, migrations, clock)  # the update
+        assert [path.name for path in (folder / "snapshots").iterdir()] == ["s0001-20261121T000000.db"]
+        clock.sleep(1)
+    run(folder, "UPDATE captures SET note = 'by the later release'")
+    assert version_of(folder / "snapshots" / "s0001-20261121T000000.db") == FIRST
+    assert_complete(folder, [1])  # rolled back: this release reads and writes
+    use(folder, 2)
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people(store).pictures.correct_laterality(next(KEYS), "c1", "OS", None)
+        people(store).pictures.correct_laterality(next(KEYS), "c1", "OD", None)
+    assert_complete(folder, [1, 2])
+    assert version_of(folder / schema.DATABASE) == SECOND
+    migrate(folder, migrations, clock)  # the update once more
+    assert len(list((folder / "snapshots").iterdir())) == 1
+    with closing(sqlite3.connect(folder / schema.DATABASE)) as tables:
+        notes = tables.execute("SELECT id, note FROM captures ORDER BY id").fetchall()
+    assert notes == [("c1", "by the later release"), ("c2", "")]
+
+
+def run(folder: Path, *statements: str) -> None:
+    with closing(sqlite3.connect(folder / schema.DATABASE, isolation_level=None)) as tables:
+        for statement in statements:
+            tables.execute(statement)
 
 
 def version_of(path: Path) -> str:
-    connection = sqlite3.connect(path)
-    version = connection.execute("SELECT version_num FROM alembic_version").fetchone()[0]
-    connection.close()
-    return str(version)
+    with closing(sqlite3.connect(path)) as tables:
+        return str(tables.execute("SELECT version_num FROM alembic_version").fetchone()[0])
 
 
 # Permitted changes of a migration
 
 
-def tables(folder: Path) -> dict[str, str]:
-    connection = sqlite3.connect(folder / "shelf.sqlite")
-    rows = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
-    connection.close()
+def definitions(migrations: Path, database: Path, version: str) -> dict[str, str]:
+    """Return the SQL of each table, index and trigger of a new database of that version, by name."""
+    config = Config()
+    config.set_main_option("script_location", str(migrations))
+    engine = schema.open_engine(database)
+    with schema.for_writing(engine).begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, version)
+    engine.dispose()
+    return definitions_in(database)
+
+
+def definitions_in(database: Path) -> dict[str, str]:
+    with closing(sqlite3.connect(database)) as tables:
+        rows = tables.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
     return {name: " ".join(sql.split()) for name, sql in rows}
 
 
@@ -113,27 +155,41 @@ def contracted(before: dict[str, str], after: dict[str, str]) -> Iterator[str]:
             yield f"{name} binds an older table"
 
 
-def marked(name: str) -> bool:
+def marked(source: str) -> bool:
     """Return whether a migration declares `takes_away = "..."`: what it removes, and the last release in need."""
-    targets = [node.targets[0] for node in nodes(text(name)) if isinstance(node, ast.Assign)]
+    targets = [node.targets[0] for node in nodes(source) if isinstance(node, ast.Assign)]
     return any(isinstance(target, ast.Name) and target.id == "takes_away" for target in targets)
 
 
-def hand_made(name: str) -> list[str]:
+def hand_made(source: str) -> list[str]:
     """Return SQL by hand that changes rows or names; docstrings are ignored."""
-    upgrades = [node for node in nodes(text(name)) if isinstance(node, ast.FunctionDef) and node.name == "upgrade"]
+    upgrades = [node for node in nodes(source) if isinstance(node, ast.FunctionDef) and node.name == "upgrade"]
     calls = [node for one in upgrades for node in ast.walk(one) if isinstance(node, ast.Call)]
     statements = [str(arg.value).upper() for call in calls for arg in call.args if isinstance(arg, ast.Constant)]
     return [word for word in CHANGES for line in statements if word in line]
 
 
-@pytest.mark.parametrize("name", MIGRATIONS)
-def test_a_migration_only_adds(name: str, tmp_path: Path) -> None:
-    version = Path(name).name.split("_")[0]
-    earlier = [one for one in VERSIONS if one < version]
-    before = tables(store_of_version(tmp_path / "before", earlier[-1])) if earlier else {}
-    after = tables(store_of_version(tmp_path / "after", version))
-    assert marked(name) or not [*contracted(before, after), *hand_made(name)]
+def test_a_migration_only_adds(tmp_path: Path, migrations: Path) -> None:
+    """Of this release, and the made-up one."""
+    scripts = sorted(ScriptDirectory(str(migrations)).walk_revisions(), key=lambda one: one.revision)
+    assert [one.revision for one in scripts][:2] == [FIRST, SECOND]
+    before: dict[str, str] = {}
+    for script in scripts:
+        after = definitions(migrations, tmp_path / f"{script.revision}.sqlite", script.revision)
+        source = Path(script.path).read_text(encoding="utf-8")
+        assert marked(source) or not [*contracted(before, after), *hand_made(source)]
+        before = after
+
+
+def test_the_tables_are_those_that_the_code_describes(tmp_path: Path) -> None:
+    """A column or an index that a migration lacks is found here; constraints and triggers are not compared."""
+    CaptureStore(tmp_path).close()
+    with closing(sqlite3.connect(tmp_path / schema.DATABASE)) as tables:
+        for name, table in schema.Base.metadata.tables.items():
+            columns = {(row[1], row[2], bool(row[3])) for row in tables.execute(f"PRAGMA table_xinfo({name})")}
+            assert columns == {(one.name, one.type.compile(), not one.nullable) for one in table.columns}, name
+            indexes = {row[1] for row in tables.execute(f"PRAGMA index_list({name})") if row[3] == "c"}
+            assert indexes == {one.name for one in table.indexes}, name
 
 
 @pytest.mark.parametrize(
@@ -155,51 +211,34 @@ def test_a_migration_only_adds(name: str, tmp_path: Path) -> None:
     ],
 )
 def test_a_change_that_breaks_an_older_release_is_detected(change: str, fine: bool, tmp_path: Path) -> None:
-    folder = store_of_version(tmp_path, "r0001")
-    connection = sqlite3.connect(folder / "shelf.sqlite")
-    connection.execute("ALTER TABLE files ADD COLUMN name2 TEXT")
-    before = tables(folder)
-    connection.execute(change)
-    connection.commit()
-    connection.close()
-    assert (list(contracted(before, tables(folder))) == []) == fine
+    CaptureStore(tmp_path).close()
+    run(tmp_path, "ALTER TABLE files ADD COLUMN name2 TEXT")
+    before = definitions_in(tmp_path / schema.DATABASE)
+    run(tmp_path, change)
+    assert (list(contracted(before, definitions_in(tmp_path / schema.DATABASE))) == []) == fine
 
 
 # Snapshots
 
 
-def test_a_snapshot_is_made_before_a_migration_and_never_without_one(tmp_path: Path) -> None:
-    Release(store_of_version(tmp_path, "r0001"), "r0001").write(1)
-    clock = VirtualClock(datetime(2026, 11, 21, tzinfo=UTC))
-    for _ in range(2):
-        with CaptureStore(tmp_path, clock=clock):
-            assert [path.name for path in (tmp_path / "snapshots").iterdir()] == ["r0001-20261121T000000.db"]
-        clock.sleep(1)
-    snapshot = tmp_path / "snapshots" / "r0001-20261121T000000.db"
-    assert version_of(snapshot) == "r0001"
-    shutil.copy(snapshot, tmp_path / "shelf.sqlite")
-    assert Release(tmp_path, "r0001").read(1)[1][0][0] == "c1"
-    with CaptureStore(tmp_path / "new", clock=clock):
-        assert not (tmp_path / "new" / "snapshots").exists()
-
-
-def test_without_space_for_a_snapshot_no_migration_runs(tmp_path: Path) -> None:
-    store_of_version(tmp_path, "r0002")
+def test_without_space_for_a_snapshot_no_migration_runs(tmp_path: Path, migrations: Path) -> None:
+    folder = tmp_path / "store"
+    use(folder, 1)
     with pytest.raises(StoreFull, match="before they are changed") as raised:
-        CaptureStore(tmp_path, free_bytes=lambda folder: 9_000_000)
+        migrate(folder, migrations, SystemClock(), free_bytes=9_000_000)
     assert "nothing was changed" in raised.value.remedy
-    assert (version_of(tmp_path / "shelf.sqlite"), list((tmp_path / "snapshots").iterdir())) == ("r0002", [])
+    assert (version_of(folder / schema.DATABASE), list((folder / "snapshots").iterdir())) == (FIRST, [])
 
 
 def test_the_last_snapshot_of_each_of_the_last_versions_is_kept(tmp_path: Path) -> None:
-    store_of_version(tmp_path, "r0001")
+    CaptureStore(tmp_path).close()
     clock = VirtualClock(datetime(2035, 1, 1, tzinfo=UTC))
-    snapshots = Snapshots(tmp_path / "shelf.sqlite", clock)
+    snapshots = Snapshots(tmp_path / schema.DATABASE, clock)
     for number in range(1, KEPT_VERSIONS + 3):
-        snapshots.create(f"r{number:04}")
+        snapshots.create(f"s{number:04}")
     clock.start = datetime(2020, 1, 1, tzinfo=UTC)  # a clock that was set back must not delete the newest
-    snapshots.create(f"r{KEPT_VERSIONS + 2:04}")
-    assert snapshots.names() == ["r0003-20350101T000000.db", "r0004-20350101T000000.db", "r0005-20200101T000000.db"]
+    snapshots.create(f"s{KEPT_VERSIONS + 2:04}")
+    assert snapshots.names() == ["s0003-20350101T000000.db", "s0004-20350101T000000.db", "s0005-20200101T000000.db"]
 
 
 def restore(folder: Path, name: str) -> str:
@@ -210,32 +249,35 @@ def restore(folder: Path, name: str) -> str:
 
 @pytest.mark.parametrize("harm", ["none", "damaged", "gone"])
 def test_a_snapshot_is_restored(harm: str, tmp_path: Path) -> None:
-    earlier = Release(store_of_version(tmp_path, "r0003"), "r0003")
-    earlier.write(1)
-    Snapshots(tmp_path / "shelf.sqlite", SystemClock()).create("r0003")
-    earlier.write(2)
+    database = tmp_path / schema.DATABASE
+    use(tmp_path, 1)
+    Snapshots(database, SystemClock()).create(FIRST)
+    use(tmp_path, 2)
     if harm == "damaged":
-        (tmp_path / "shelf.sqlite").write_bytes(b"not tables" * 1000)
+        database.write_bytes(b"not tables" * 1000)
     elif harm == "gone":
-        (tmp_path / "shelf.sqlite").unlink()
+        database.unlink()
     names = CliRunner().invoke(app, ["list", "--data", str(tmp_path)]).output.split()
     words = restore(tmp_path, names[0])
     assert "1 captures were kept since, from c2 on" in words
-    aside = tmp_path / "snapshots" / "replaced-1"
-    assert (aside / "shelf.sqlite").exists() == (harm != "gone")
+    assert (tmp_path / "snapshots" / "replaced-1" / database.name).exists() == (harm != "gone")
+    with closing(sqlite3.connect(database)) as tables:
+        assert tables.execute("SELECT id FROM captures").fetchall() == [("c1",)]
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert ([one.id for one in store.captures()], store.newly_quarantined) == (["c1"], ("c2",))
+        assert (store.recovery.adopted, store.newly_quarantined) == (["c2"], ())
+        assert ledger(store).spent_j_per_cm2("OD") == 3.0
+    assert_complete(tmp_path, [1, 2])
 
 
 def test_restoring_is_refused_for_a_running_instrument_and_for_a_damaged_snapshot(tmp_path: Path) -> None:
     with CaptureStore(tmp_path) as store:
-        snapshots = Snapshots(tmp_path / "shelf.sqlite", SystemClock())
-        snapshots.create(HEAD)
+        snapshots = Snapshots(tmp_path / schema.DATABASE, SystemClock())
+        snapshots.create(FIRST)
         assert store.captures() == []
         with pytest.raises(StoreError, match="is running"):
             snapshots.restore(snapshots.names()[0])
     with pytest.raises(RecordNotFound):
-        snapshots.restore("../shelf.sqlite")
+        snapshots.restore(f"../{schema.DATABASE}")
     name = snapshots.names()[0]
     path = snapshots.folder / name
     content = bytearray(path.read_bytes())
@@ -245,58 +287,17 @@ def test_restoring_is_refused_for_a_running_instrument_and_for_a_damaged_snapsho
         snapshots.restore(name)
 
 
-# Columns of a capture that are computed from its report (r0005)
-
-
-def columns(folder: Path) -> dict[str, tuple[object, ...]]:
-    """Return visit, slot, verdict and laterality of each capture by id, as the tables have them."""
-    with closing(sqlite3.connect(folder / "shelf.sqlite")) as connection:
-        found = connection.execute("SELECT id, visit, slot, verdict, laterality FROM captures").fetchall()
-    return {id: tuple(values) for id, *values in found}
-
-
-def test_columns_of_stored_captures_hold_the_entries_of_their_reports(tmp_path: Path) -> None:
-    Release(store_of_version(tmp_path, "r0004"), "r0004").write(1)
-    shutil.copytree(EARLIER["r0004"], tmp_path / "kept")
-    with CaptureStore(tmp_path, reserve_bytes=0), CaptureStore(tmp_path / "kept", reserve_bytes=0) as kept:
-        assert columns(tmp_path) == {"c1": (None, None, '{"n":1}', None)}
-        stored = {one.id: one.report for one in kept.captures()}
-        assert {id: row[:2] for id, row in columns(kept.folder).items()} == {
-            id: (report.visit, report.slot) for id, report in stored.items()
-        }
-        for id, (_, _, verdict, laterality) in columns(kept.folder).items():
-            assert (read_verdict(json.loads(str(verdict))), laterality) == (stored[id].verdict, None)
-
-
-def test_after_a_rollback_the_columns_follow_what_the_earlier_release_writes(tmp_path: Path) -> None:
-    """A capture and a corrected eye that the earlier release writes have their columns without another migration."""
-    earlier = Release(store_of_version(tmp_path, "r0004"), "r0004")
-    earlier.write(1)
-    with CaptureStore(tmp_path, reserve_bytes=0):
-        pass
-    earlier.write(2)
-    report = {"visit": "v1", "slot": "R-nerve", "verdict": {"word": "good"}, "laterality": {"eye": "OS"}}
-    with closing(sqlite3.connect(tmp_path / "shelf.sqlite", isolation_level=None)) as old:
-        old.execute("UPDATE captures SET eye=?, report=? WHERE captures.id = ?", ("OD", json.dumps(report), "c1"))
-        old.execute("UPDATE shots SET slot=? WHERE shots.capture = ?", ("R-nerve", "c1"))
-    with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert columns(tmp_path) == {
-            "c1": ("v1", "R-nerve", '{"word":"good"}', '{"eye":"OS"}'),
-            "c2": (None, None, '{"n":2}', None),
-        }
-        slots = VisitRepository(store.engine, load_protocol(), SystemClock()).get("v1").slots
-        assert [one.capture for one in slots["R-nerve"].captures] == ["c1"]
-        assert slots["R-nerve"].captures[0].is_good
+# Columns of a capture that are computed from its report
 
 
 @pytest.mark.parametrize("report", ["{", "", "null", "[]", "3", '{"slot": 3, "verdict": "x", "laterality": [1]}'])
 def test_a_report_without_usable_entries_has_empty_columns(report: str, tmp_path: Path) -> None:
-    """An earlier release may have written it, or the disk may have damaged it; its capture keeps its slot."""
-    Release(store_of_version(tmp_path, "r0004"), "r0004").write(1)
-    with closing(sqlite3.connect(tmp_path / "shelf.sqlite", isolation_level=None)) as old:
-        old.execute("PRAGMA ignore_check_constraints = ON")
-        old.execute("UPDATE captures SET report = ?", (report,))
+    """The disk may have damaged it; its capture keeps its slot."""
+    use(tmp_path, 1)
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert columns(tmp_path) == {"c1": (None, None, None, None)}
-        slots = VisitRepository(store.engine, load_protocol(), SystemClock()).get("v1").slots
-        assert slots["R-centre"].captures == (SlotCapture("c1", None),)
+        with closing(sqlite3.connect(tmp_path / schema.DATABASE, isolation_level=None)) as other:
+            other.execute("PRAGMA ignore_check_constraints = ON")
+            other.execute("UPDATE captures SET report = ?", (report,))
+            (columns,) = other.execute("SELECT visit, slot, verdict, laterality FROM captures").fetchall()
+        assert columns == (None, None, None, None)
+        assert [one.slots["R-centre"].captures for one in people(store).visits(10)] == [(SlotCapture("c1", None),)]

@@ -58,7 +58,7 @@ def test_a_data_folder_is_private_with_any_umask(umask: int, tmp_path: Path) -> 
         store.save(Capture("c", "OD", NOON, True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
         DoseLedgerStore(store.engine, clock, 86_400.0, "boot")
         CaptureJournal(store).begin(InterruptedCapture("d", "OD"))
-        Snapshots(data / "shelf.sqlite", clock).create("r0001")
+        Snapshots(data / "store.sqlite", clock).create("s0001")
         PinAuthenticator(data / "technician.json", clock).set_pin("1234", None)
         log = EventLog(data / "diary")
         getLogger("services").info("an entry")
@@ -72,7 +72,7 @@ def test_a_data_folder_is_private_with_any_umask(umask: int, tmp_path: Path) -> 
             key_for_recipients([str(pyrage.x25519.Identity.generate().to_public())]),
         )
         Planner(data / "plans", effort="FFTW_MEASURE").plan((30, 42))
-        assert (data / "shelf.sqlite-wal").exists()
+        assert (data / "store.sqlite-wal").exists()
         assert modes(data) == {}
     [backup] = (tmp_path / "stick").iterdir()
     assert modes(backup) == {}
@@ -96,7 +96,7 @@ def test_an_existing_data_folder_becomes_private(tmp_path: Path, mode: int) -> N
 
 def test_a_database_that_others_could_read_becomes_private(tmp_path: Path) -> None:
     CaptureStore(tmp_path / "data", reserve_bytes=0).close()
-    (tmp_path / "data/shelf.sqlite").chmod(0o644)
+    (tmp_path / "data/store.sqlite").chmod(0o644)
     CaptureStore(tmp_path / "data", reserve_bytes=0).close()
     assert modes(tmp_path / "data") == {}
 

@@ -6,6 +6,7 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import SettingError, StoreError
 from services.errors import StoreDamaged
+from services.records import schema
 from services.records.capture import Capture, CaptureReport, PictureVerdict
 from services.records.capture_store import CaptureStore
 from services.records.protocol import load_protocol
@@ -23,7 +25,6 @@ from services.records.record_files import CAPTURE_RECORD as RECORD
 from services.records.recovery_report import RecoveryReport
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
-from tests.earlier import Release, store_of_version
 from tests.store_damage import Shown, expected, filled_store, shown
 
 FILES = {name: name.encode() * 50 for name in REQUIRED_FILES}
@@ -43,7 +44,7 @@ def saved(store: CaptureStore, id: str) -> Capture:
 
 
 def without_rows(folder: Path, *statements: str) -> None:
-    with sqlite3.connect(folder / "shelf.sqlite", isolation_level=None) as database:
+    with sqlite3.connect(folder / "store.sqlite", isolation_level=None) as database:
         for statement in statements:
             database.execute(statement)
     database.close()
@@ -57,7 +58,7 @@ def flip(path: Path, content: bytes, changed: bytes, nth: int = 0) -> None:
     path.write_bytes(before[:place] + changed + before[place + len(content) :])
 
 
-LOST_ROWS = ("DELETE FROM shots", "DELETE FROM files", "DELETE FROM captures")
+LOST_ROWS = ("DELETE FROM capture_slots", "DELETE FROM files", "DELETE FROM captures")
 
 
 def test_captures_without_rows_are_adopted_with_all_that_was_stored(store: CaptureStore) -> None:
@@ -83,7 +84,7 @@ def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> 
     stored = store.get("a")
     assert stored.eye == "OS"
     store.close()
-    without_rows(store.folder, "DELETE FROM slots", *LOST_ROWS)
+    without_rows(store.folder, "DELETE FROM slot_decisions", *LOST_ROWS)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.get("a") == stored, "the record holds the correction of the eye"
         slots = VisitRepository(again.engine, load_protocol(), VirtualClock()).get(visit).slots
@@ -94,7 +95,7 @@ def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> 
 def test_an_unreadable_row_is_healed_and_its_neighbours_are_unchanged(store: CaptureStore) -> None:
     kept = [saved(store, id) for id in ("a", "b", "c")]
     store.close()
-    flip(store.folder / "shelf.sqlite", b'"level": 0.25', b'"level": 0.75', nth=1)
+    flip(store.folder / "store.sqlite", b'"level": 0.25', b'"level": 0.75', nth=1)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert (len(again.recovery.healed), again.recovery.rebuilt_because, again.damaged()) == (1, None, 0)
         assert again.captures() == kept[::-1]
@@ -103,11 +104,11 @@ def test_an_unreadable_row_is_healed_and_its_neighbours_are_unchanged(store: Cap
 def test_an_entry_that_is_no_json_rebuilds_the_database(store: CaptureStore) -> None:
     kept = [saved(store, id) for id in ("a", "b", "c")]
     store.close()
-    flip(store.folder / "shelf.sqlite", b'"level": 0.25', b'"level"; 0.25', nth=1)
+    flip(store.folder / "store.sqlite", b'"level": 0.25', b'"level"; 0.25', nth=1)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.recovery.rebuilt_because == "CHECK constraint failed in captures"
         assert sorted(again.captures(), key=lambda one: one.id) == kept
-    assert (store.folder / "damaged" / "1" / "shelf.sqlite").exists()
+    assert (store.folder / "damaged" / "1" / "store.sqlite").exists()
 
 
 @pytest.mark.parametrize("name", [RECORD, "raw.tiff"])
@@ -138,10 +139,14 @@ def test_a_database_that_takes_no_rows_does_not_prevent_the_start(store: Capture
     kept = saved(store, "a")
     store.close()
     refuse = "CREATE TRIGGER full BEFORE INSERT ON captures BEGIN SELECT RAISE(FAIL, 'no space'); END"
-    without_rows(store.folder, *LOST_ROWS, refuse, "PRAGMA user_version = 0")
+    without_rows(store.folder, *LOST_ROWS, refuse)
+    with closing(sqlite3.connect(store.folder / "store.sqlite", isolation_level=None)) as tables:
+        (before,) = tables.execute("PRAGMA user_version").fetchone()
+        checksum = schema.schema_checksum(tables.execute(schema.SCHEMA_TEXT).fetchall())
+        tables.execute(f"PRAGMA user_version = {checksum}")
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert (again.recovery.adopted, again.quarantine.orphans()) == ([], ["a"])
-    without_rows(store.folder, "DROP TRIGGER full")
+    without_rows(store.folder, "DROP TRIGGER full", f"PRAGMA user_version = {before}")
     with CaptureStore(store.folder, reserve_bytes=0) as once_more:
         assert (once_more.recovery.adopted, once_more.captures()) == (["a"], [kept])
 
@@ -175,7 +180,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Shown]:
 
 def test_the_files_of_a_store_alone_rebuild_all_that_it_shows(filled: tuple[Path, Shown], tmp_path: Path) -> None:
     folder, before = shutil.copytree(filled[0], tmp_path / "copy"), filled[1]
-    (folder / "shelf.sqlite").unlink()
+    (folder / "store.sqlite").unlink()
     with CaptureStore(folder, reserve_bytes=0) as store:
         assert store.recovery.rebuilt_because == "it is missing or empty"
         assert (len(store.recovery.adopted), len(store.recovery.visits)) == (len(before.captures), len(before.visits))
@@ -191,14 +196,14 @@ def test_an_older_database_does_not_undo_later_changes(tmp_path: Path) -> None:
         visit = people.begin(next(KEYS)).id
         people.answer(next(KEYS), visit, "age", 40)
         people.answer(next(KEYS), visit, "name", "Asha")
-    older = (folder / "shelf.sqlite").read_bytes()
+    older = (folder / "store.sqlite").read_bytes()
     with CaptureStore(folder, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
         people.answer(next(KEYS), visit, "age", 41)
         people.answer(next(KEYS), visit, "name", "Usha")
         people.finish(next(KEYS), visit)
         latest = people.get(visit), people.get(people.begin(next(KEYS)).id)
-    (folder / "shelf.sqlite").write_bytes(older)
+    (folder / "store.sqlite").write_bytes(older)
     with CaptureStore(folder, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
         assert tuple(people.get(one.id) for one in latest) == latest
@@ -217,7 +222,7 @@ def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path
         report = CaptureReport(visit=visit, slot="R-centre", verdict=PictureVerdict("good"))
         taken = Capture("a", "OD", clock.wall(), True, "00ff", report, {})
         store.save(taken, FILES, target.write_rows, target.request)
-    (folder / "shelf.sqlite").unlink()
+    (folder / "store.sqlite").unlink()
     with CaptureStore(folder, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
         assert people.begin(begin).id == visit
@@ -230,10 +235,10 @@ def test_a_change_that_was_killed_between_file_and_commit_is_applied_as_a_whole(
         people = VisitRepository(store.engine, load_protocol(), clock)
         visit = people.begin(next(KEYS)).id
         people.answer(next(KEYS), visit, "age", 40)
-    older = (folder / "shelf.sqlite").read_bytes()
+    older = (folder / "store.sqlite").read_bytes()
     with CaptureStore(folder, reserve_bytes=0) as store:
         changed = VisitRepository(store.engine, load_protocol(), clock).finish(next(KEYS), visit)
-    (folder / "shelf.sqlite").write_bytes(older)
+    (folder / "store.sqlite").write_bytes(older)
     for _ in range(2):
         with CaptureStore(folder, reserve_bytes=0) as store:
             assert VisitRepository(store.engine, load_protocol(), clock).get(visit) == changed
@@ -245,7 +250,9 @@ def test_a_change_that_the_database_refuses_leaves_the_files_as_they_were(tmp_pa
         people = VisitRepository(store.engine, load_protocol(), clock)
         visit = people.begin(next(KEYS)).id
         before = files_of(folder)
-        without_rows(folder, "CREATE TRIGGER full BEFORE INSERT ON keys BEGIN SELECT RAISE(FAIL, 'no space'); END")
+        without_rows(
+            folder, "CREATE TRIGGER full BEFORE INSERT ON idempotency_keys BEGIN SELECT RAISE(FAIL, 'no space'); END"
+        )
         for act in (lambda: people.answer(next(KEYS), visit, "age", 40), lambda: people.begin(next(KEYS))):
             with pytest.raises(StoreError):
                 act()
@@ -256,59 +263,56 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for name in ("visits", "patients") for path in (folder / name).iterdir()}
 
 
-@pytest.mark.parametrize("later", ["earlier release", "this release"])
-def test_after_a_rollback_on_older_tables_the_later_change_is_used_and_the_other_stored(
-    tmp_path: Path, later: str
+LATER, EARLIER = "2026-03-01T18:00:00+00:00", "2026-03-01T12:30:00+00:00"
+
+
+@pytest.mark.parametrize(("age", "set_at", "used", "other"), [(70, LATER, 70, 60), (51, EARLIER, 60, 51)])
+def test_after_older_tables_were_changed_the_later_change_is_used_and_the_other_stored(
+    tmp_path: Path, age: int, set_at: str, used: int, other: int
 ) -> None:
-    earlier = Release(store_of_version(tmp_path, "r0005"), "r0005")
-    earlier.write(1)
-    clock = VirtualClock(start=datetime(2026, 3, 1, 13, tzinfo=UTC))
+    clock = VirtualClock(start=datetime(2026, 3, 1, 12, tzinfo=UTC))
+    snapshots = Snapshots(tmp_path / "store.sqlite", clock)
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
-        people.reopen(next(KEYS), "v1")
-        people.answer(next(KEYS), "v1", "age", 60)
+        visit = people.answer(next(KEYS), people.begin(next(KEYS)).id, "age", 50).id
+        saved(store, "old")
+        snapshots.create("s0001")
+        clock.sleep(3600)
+        people.answer(next(KEYS), visit, "age", 60)
         saved(store, "new")
-    snapshots = Snapshots(tmp_path / "shelf.sqlite", clock)
     snapshots.restore(snapshots.names()[0])
-    earlier.write(2)
-    if later == "earlier release":
-        without_rows(
-            tmp_path, "UPDATE fields SET value = '70', set_at = '2026-03-01T18:00:00+00:00' WHERE visit = 'v1'"
-        )
-    new_folder = {path.name: path.read_bytes() for path in (tmp_path / "captures" / "new").iterdir()}
+    without_rows(tmp_path, f"UPDATE answers SET value = '{age}', set_at = '{set_at}' WHERE name = 'age'")
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
-        assert {one.id for one in store.captures()} == {"c1", "c2", "new"}
-        assert {name: store.read("new", name) for name in FILES} == {name: new_folder[name] for name in FILES}
-        assert {one.id for one in people.visits(10)} == {"v1", "v2"}
-        used, other = (70, 60) if later == "earlier release" else (60, 51)
-        assert people.get("v1").fields["age"] == used
-        stored = [json.loads(path.read_bytes())["record"] for path in (tmp_path / "conflicts").glob("visit-v1-*")]
+        assert {one.id for one in store.captures()} == {"old", "new"}
+        assert {name: store.read("new", name) for name in FILES} == FILES
+        assert people.get(visit).fields["age"] == used
+        stored = [json.loads(path.read_bytes())["record"] for path in (tmp_path / "conflicts").glob(f"visit-{visit}-*")]
         assert [one["answers"]["age"]["value"] for one in stored] == [other]
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         assert store.recovery == RecoveryReport()
 
 
 @pytest.mark.parametrize(("number", "other"), [("X1", "X1-2"), ("A" * 20, "A" * 18 + "-2")])
-def test_a_number_that_was_given_again_after_a_rollback_mixes_up_no_patients(
+def test_a_number_that_was_given_again_in_older_tables_mixes_up_no_patients(
     tmp_path: Path, number: str, other: str
 ) -> None:
     clock = VirtualClock(start=datetime(2026, 3, 1, 13, tzinfo=UTC))
-    store_of_version(tmp_path, "r0005")
+    snapshots = Snapshots(tmp_path / "store.sqlite", clock)
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        snapshots.create("s0001")
         people = VisitRepository(store.engine, load_protocol(), clock)
         visit = people.begin(next(KEYS), number).id
         people.answer(next(KEYS), visit, "name", "Asha")
         people.answer(next(KEYS), visit, "age", 30)
-    snapshots = Snapshots(tmp_path / "shelf.sqlite", clock)
     snapshots.restore(snapshots.names()[0])
     now = "'2026-03-01T18:00:00.000000+00:00'"
-    without_rows(  # the earlier release gives the number to another patient
+    without_rows(  # the number is given to another patient
         tmp_path,
-        f"INSERT INTO persons (number, made_at) VALUES ('{number}', {now})",
-        f"INSERT INTO identifiers (person, name, value) VALUES ('{number}', 'name', '\"Usha\"')",
-        f"INSERT INTO visits (id, person, day, begun_at) VALUES ('v1', '{number}', '2026-03-01', {now})",
-        f"INSERT INTO fields (visit, name, value, set_at) VALUES ('v1', 'age', '51', {now})",
+        f"INSERT INTO patients (number, made_at, patient_id) VALUES ('{number}', {now}, '{'0' * 16}')",
+        f"INSERT INTO identifiers (patient, name, value) VALUES ('{number}', 'name', '\"Usha\"')",
+        f"INSERT INTO visits (id, patient, day, begun_at) VALUES ('v1', '{number}', '2026-03-01', {now})",
+        f"INSERT INTO answers (visit, name, value, set_at) VALUES ('v1', 'age', '51', {now})",
     )
     for _ in range(2):
         with CaptureStore(tmp_path, reserve_bytes=0) as store:
@@ -329,7 +333,7 @@ def test_a_damaged_id_of_a_patient_is_restored(store: CaptureStore) -> None:
     store.close()
     id = documents(store.folder)[0].id
     changed = ("f" if id[0] != "f" else "e") + id[1:]
-    flip(store.folder / "shelf.sqlite", id.encode(), changed.encode())
+    flip(store.folder / "store.sqlite", id.encode(), changed.encode())
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert VisitRepository(again.engine, load_protocol(), VirtualClock()).visits(10) == before
     assert [one.id for one in documents(store.folder)] == [id]
@@ -339,7 +343,7 @@ def test_a_changed_definition_of_a_table_rebuilds_the_database(store: CaptureSto
     """SQLite's integrity check passes, because the definition is valid."""
     kept = saved(store, "a")
     store.close()
-    flip(store.folder / "shelf.sqlite", b"length(value) <= 2000", b"length(value) <= 3000")
+    flip(store.folder / "store.sqlite", b"length(value) <= 2000", b"length(value) <= 3000")
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.recovery.rebuilt_because == "the definitions of its tables are not those that were written"
         assert again.captures() == [kept]

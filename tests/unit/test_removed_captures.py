@@ -97,9 +97,9 @@ def test_removed_files_count_as_free_space(tmp_path: Path) -> None:
 
 def test_a_rebuilt_database_knows_that_the_files_were_removed(store: CaptureStore) -> None:
     store.removed.remove(["a"], REMOVAL)
-    (store.folder / "shelf.sqlite").unlink()
+    (store.folder / "store.sqlite").unlink()
     store.close()
-    for log in store.folder.glob("shelf.sqlite-*"):
+    for log in store.folder.glob("store.sqlite-*"):
         log.unlink()
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert sorted(again.recovery.adopted) == ["a", "b"]

@@ -79,7 +79,7 @@ def test_a_store_of_another_user_is_a_clear_error_and_stays_as_it_was(
     folder: Path, folder_mode: int, database_mode: int
 ) -> None:
     folder.chmod(folder_mode)
-    (folder / "shelf.sqlite").chmod(database_mode)
+    (folder / "store.sqlite").chmod(database_mode)
     before = {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))}
 
     def open_it() -> None:
@@ -159,7 +159,7 @@ def test_two_programs_on_one_store_lose_nothing(folder: Path) -> None:
 @pytest.fixture
 def locked(folder: Path) -> Iterator[CaptureStore]:
     """A store on whose database another connection holds the write lock."""
-    with CaptureStore(folder, reserve_bytes=0) as store, closing(sqlite3.connect(folder / "shelf.sqlite")) as other:
+    with CaptureStore(folder, reserve_bytes=0) as store, closing(sqlite3.connect(folder / "store.sqlite")) as other:
         other.execute("BEGIN IMMEDIATE")
         yield store
         other.execute("ROLLBACK")
@@ -172,7 +172,7 @@ def test_a_locked_database_is_found_by_the_health_check(locked: CaptureStore) ->
 
 def test_a_locked_database_refuses_the_light_with_its_own_remedy(tmp_path: Path) -> None:
     """Not "free some space": what helps is to close the other program."""
-    with CaptureStore(tmp_path, reserve_bytes=0) as store, closing(sqlite3.connect(tmp_path / "shelf.sqlite")) as other:
+    with CaptureStore(tmp_path, reserve_bytes=0) as store, closing(sqlite3.connect(tmp_path / "store.sqlite")) as other:
         ledger = DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, "boot")
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(StoreLocked) as raised:

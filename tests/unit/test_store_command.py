@@ -69,7 +69,7 @@ def test_a_changed_file_of_a_capture_is_damaged(filled: tuple[Path, Shown], tmp_
 
 def test_a_missing_database_is_healable_and_rebuild_restores_it(filled: tuple[Path, Shown], tmp_path: Path) -> None:
     folder = shutil.copytree(filled[0], tmp_path / "store")
-    (folder / "shelf.sqlite").write_bytes(b"no database")
+    (folder / "store.sqlite").write_bytes(b"no database")
     status, found = check(folder)
     assert (status, len(found["database"]["healable"]), len(found["visits"]["healable"])) == (
         1,
@@ -77,7 +77,7 @@ def test_a_missing_database_is_healable_and_rebuild_restores_it(filled: tuple[Pa
         len(filled[1].visits),
     )
     done = CliRunner().invoke(app, ["rebuild", "--yes", "--data", str(folder)])
-    assert (done.exit_code, (folder / "damaged" / "1" / "shelf.sqlite").read_bytes()) == (0, b"no database")
+    assert (done.exit_code, (folder / "damaged" / "1" / "store.sqlite").read_bytes()) == (0, b"no database")
     assert f"{len(filled[1].visits)} visits and {len(filled[1].captures)} captures" in done.stdout
     assert shown(folder) == (filled[1], 0)
 

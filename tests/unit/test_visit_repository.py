@@ -1,88 +1,22 @@
-"""Visit repository: migrations with data, rollback to an earlier release, decisions on slots, idempotency keys."""
+"""Visit repository: numbers, decisions on slots, undo of a finish, idempotency keys, constraints of the tables."""
 
-import json
 import sqlite3
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
 import pytest
-from alembic import command
 
 from device.clock import VirtualClock
 from device.errors import SpecError
 from services.errors import IdempotencyKeyConflict, RecordNotFound, VisitFinished
-from services.records import schema
 from services.records.capture import Capture, CaptureReport, PictureVerdict
-from services.records.capture_report import read_report
 from services.records.capture_store import CaptureStore
 from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
 from services.records.visit_repository import VisitRepository
-from tests.unit.test_migrations import contracted
 
-ID = "20260301T120000-OD-aa"
 FILES = {"raw.tiff": b"raw" * 100, "report.json": b"{}"}
-# Statements of the earlier release, word for word.
-OLD_INSERT = (
-    "INSERT INTO captures (id, eye, taken_at, simulated, calibration_id, report) VALUES (?, ?, ?, ?, ?, ?)",
-    "INSERT INTO files (capture_id, name, sha256, bytes) VALUES (?, ?, ?, ?)",
-)
-OLD_SELECT = (
-    "SELECT captures.id, captures.eye, captures.taken_at, captures.simulated, captures.calibration_id, captures.report "
-    "FROM captures ORDER BY captures.taken_at DESC, captures.id DESC LIMIT 50",
-    "SELECT coalesce(sum(files.bytes), 0), count(DISTINCT files.capture_id) FROM files",
-)
-OLD_LIGHT = (
-    "INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES ('OD', 7, 0.5)",
-    "UPDATE light_doses SET dose_j_per_cm2 = 0.25 WHERE eye = 'OD' AND slot = 7",
-    "DELETE FROM light_doses WHERE eye = 'OD' AND slot = 7",
-)
 keys = (f"{number:016x}" for number in count(1))
-
-
-def old_capture(connection: sqlite3.Connection, id: str = ID, folder: Path | None = None) -> None:
-    """Store a capture with the statements of an earlier release: files first, then rows."""
-    moment = "2026-03-01T12:00:00.000000+00:00"
-    connection.execute(OLD_INSERT[0], (id, "OD", moment, 1, "00ff", json.dumps({"method": "x"})))
-    for name, content in FILES.items():
-        connection.execute(OLD_INSERT[1], (id, name, "0" * 64, len(content)))
-        if folder is not None:
-            (folder / "captures" / id).mkdir(parents=True, exist_ok=True)
-            (folder / "captures" / id / name).write_bytes(content)
-
-
-def tables(connection: sqlite3.Connection, names: set[str]) -> dict[str, str]:
-    rows = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
-    return {name: sql for name, sql in rows if name in names}
-
-
-@pytest.mark.parametrize("release", ["r0001", "r0002"])
-def test_tables_of_an_earlier_release_keep_their_data(tmp_path: Path, release: str) -> None:
-    engine = schema.open_engine(tmp_path / "shelf.sqlite")
-    config = schema.migration_config()
-    with schema.for_writing(engine).begin() as connection:
-        config.attributes["connection"] = connection
-        command.upgrade(config, release)
-    engine.dispose()
-    with sqlite3.connect(tmp_path / "shelf.sqlite", isolation_level=None) as old:
-        old_capture(old, folder=tmp_path)
-        names = {name for (name,) in old.execute("SELECT name FROM sqlite_schema")} - {"alembic_version"}
-        before = tables(old, names)
-        if release == "r0002":
-            old.execute(OLD_LIGHT[0])
-    old.close()
-    with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert store.newly_quarantined == ()
-        kept = store.get(ID)
-        assert (kept.eye, kept.report) == ("OD", read_report({"method": "x"}))
-        people = VisitRepository(store.engine, load_protocol(), VirtualClock())
-        assert people.begin(next(keys)).number == "A00013"
-    with sqlite3.connect(tmp_path / "shelf.sqlite") as new:
-        assert not [*contracted(before, tables(new, names))]  # expanded only
-        doses = new.execute("SELECT dose_j_per_cm2 FROM light_doses").fetchall()
-        assert doses == ([(0.5,)] if release == "r0002" else [])
-        assert new.execute("PRAGMA foreign_key_check").fetchall() == []
-    new.close()
 
 
 @pytest.fixture
@@ -106,24 +40,6 @@ def shoot(store: CaptureStore, people: VisitRepository, visit: str, slot: str, i
     report = CaptureReport(visit=target.visit, slot=target.slot, verdict=PictureVerdict(word))
     store.save(Capture(id, "OD", people.clock.wall(), True, "00ff", report, {}), FILES, target.write_rows)
     people.clock.sleep(1)
-
-
-def test_the_earlier_release_works_on_the_present_tables(store: CaptureStore, people: VisitRepository) -> None:
-    """An update may be rolled back after visits were made: the earlier statements still work, and their data stay."""
-    visit = people.get(agreed(people))
-    shoot(store, people, visit.id, "R-centre", "a")
-    with sqlite3.connect(store.folder / "shelf.sqlite", isolation_level=None) as old:
-        old.execute("PRAGMA foreign_keys = ON")
-        old_capture(old, folder=store.folder)
-        assert {row[0] for row in old.execute(OLD_SELECT[0])} == {ID, "a"}
-        assert old.execute(OLD_SELECT[1]).fetchone()[1] == 2
-        for words in OLD_LIGHT:
-            old.execute(words)
-    old.close()
-    with CaptureStore(store.folder, reserve_bytes=0) as again:
-        assert again.newly_quarantined == ()
-        assert VisitRepository(again.engine, load_protocol(), VirtualClock()).get(visit.id) == people.get(visit.id)
-        assert again.get(ID).report == read_report({"method": "x"})
 
 
 def test_the_best_picture_is_chosen_until_the_user_decides(store: CaptureStore, people: VisitRepository) -> None:
@@ -180,7 +96,7 @@ def test_a_capture_of_an_unknown_visit_is_not_stored(store: CaptureStore, people
 def test_names_are_in_the_table_of_identifiers_only(store: CaptureStore, people: VisitRepository) -> None:
     visit = people.begin(next(keys)).id
     people.answer(next(keys), visit, "name", "Meenakshi")
-    with sqlite3.connect(store.folder / "shelf.sqlite") as connection:
+    with sqlite3.connect(store.folder / "store.sqlite") as connection:
         names = [name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
         rows = {name: repr(connection.execute(f"SELECT * FROM {name}").fetchall()) for name in names}
     connection.close()
@@ -226,26 +142,26 @@ def test_an_invalid_protocol_is_refused_with_the_key_of_the_mistake(tmp_path: Pa
 @pytest.mark.parametrize(
     "statement",
     [
-        "INSERT INTO visits (id, person, day, begun_at) VALUES ('v', 'no one', '2026-01-01', 'x')",
-        "INSERT INTO persons (number, made_at) VALUES ('', 'x')",
-        "INSERT INTO persons (number, made_at) VALUES ('123456789012345678901', 'x')",
+        "INSERT INTO visits (id, patient, day, begun_at) VALUES ('v', 'no one', '2026-01-01', 'x')",
+        "INSERT INTO patients (number, made_at, patient_id) VALUES ('', 'x', 'id')",
+        "INSERT INTO patients (number, made_at, patient_id) VALUES ('123456789012345678901', 'x', 'id')",
         "UPDATE visits SET finished_at = 'x'",
         "UPDATE visits SET outcome = '{}'",
-        "DELETE FROM persons",
-        "INSERT INTO fields SELECT id, 'age', 'fifty', 'x' FROM visits",
-        "INSERT INTO slots SELECT id, 'R-centre', 'no capture', NULL FROM visits",
-        "INSERT INTO keys VALUES ('short', 'a', 'b', 'c')",
+        "DELETE FROM patients",
+        "INSERT INTO answers SELECT id, 'age', 'fifty', 'x' FROM visits",
+        "INSERT INTO slot_decisions SELECT id, 'R-centre', 'no capture', NULL FROM visits",
+        "INSERT INTO idempotency_keys VALUES ('short', 'a', 'b', 'c')",
         "UPDATE counters SET last = 'many'",
-        "INSERT INTO sendings SELECT id, 'x', -1, NULL, NULL, NULL, NULL, NULL, NULL FROM visits",
-        "INSERT INTO sendings SELECT id, 'x', 1, NULL, NULL, NULL, 'today', NULL, NULL FROM visits",
-        "INSERT INTO sendings VALUES ('no visit', 'x', 1, NULL, NULL, NULL, NULL, NULL, NULL)",
+        "INSERT INTO uploads SELECT id, 'x', -1, NULL, NULL, NULL, NULL, NULL, NULL FROM visits",
+        "INSERT INTO uploads SELECT id, 'x', 1, NULL, NULL, NULL, 'today', NULL, NULL FROM visits",
+        "INSERT INTO uploads VALUES ('no visit', 'x', 1, NULL, NULL, NULL, NULL, NULL, NULL)",
     ],
 )
 def test_the_constraints_of_the_tables_refuse_invalid_rows(
     store: CaptureStore, people: VisitRepository, statement: str
 ) -> None:
     people.begin(next(keys))
-    with sqlite3.connect(store.folder / "shelf.sqlite") as connection:
+    with sqlite3.connect(store.folder / "store.sqlite") as connection:
         connection.execute("PRAGMA foreign_keys = ON")
         with pytest.raises(sqlite3.IntegrityError):
             connection.execute(statement)
