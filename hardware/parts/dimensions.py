@@ -13,8 +13,10 @@ from device.optics.led_cap import cap_height_mm
 from device.optics.lens_data import LayoutSpec, named_glass
 from device.optics.light_path import LightPath, load_light_path, relay_of
 from device.optics.matrix import led_positions_mm, ring
+from device.optics.traced_relay import traced_relay
 
 OPTICS = Path(__file__).parents[1] / "optics.toml"
+FLANGE_PLATE_MM = 3.0
 Place = tuple[float, float]
 FOUR = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
@@ -184,6 +186,22 @@ class Dimensions:
     def block_z_mm(self) -> Place:
         """Front and rear face of the splitter block."""
         return self.plate_z_mm - self.bought.led_board_mm[1] / 2 - 1.8, self.cell_front_z_mm
+
+    @property
+    def tube_stop_z_mm(self) -> float:
+        """Floor of the flange's socket, on which the lens tube ends: no lens comes nearer to the iris."""
+        return self.block_z_mm[0] - FLANGE_PLATE_MM
+
+    @property
+    def pupil_to_glass_mm(self) -> float:
+        """From the pupil of the eye to the first glass, with the tube at its stop.
+
+        The stop keeps the lenses farther from the iris than the layout has them, so the eye comes nearer to them.
+        """
+        traced = traced_relay(self.path)
+        faces = traced.lamp_surfaces
+        more_mm = -self.tube_stop_z_mm - (traced.iris_at_mm - faces[-1].at_mm)
+        return faces[0].at_mm - more_mm * self.path.optics.angular_magnification**2
 
     @property
     def cell_front_z_mm(self) -> float:

@@ -142,20 +142,20 @@ def step(name: str, d: Dimensions) -> str:
 
 
 def relay(d: Dimensions) -> str:
-    """The lenses cut along their axis, as they stand in the tubes: which face looks where, and distances of glass."""
-    traced = traced_relay(d.path)
-    faces, half = traced.lamp_surfaces, d.path.relay.lens_mm / 2
+    """The lenses cut along their axis, with the tube at its stop: which face looks where, and distances."""
+    faces, half = traced_relay(d.path).lamp_surfaces, d.path.relay.lens_mm / 2
+    pupil, iris = faces[0].at_mm - d.pupil_to_glass_mm, faces[-1].at_mm - d.tube_stop_z_mm
     lenses = [_lens(faces[first : first + 3], half) for first in range(0, len(faces), 3)]
-    planes = [Drawn("", z, -half, z, half) for z in (0.0, traced.iris_at_mm)]
+    planes = [Drawn("", z, -half, z, half) for z in (pupil, iris)]
     sheet = Sheet("Step 1, relay: the lenses cut along their axis", [*lenses, *planes], 4.0)
     last, second = len(faces) // 2 - 1, len(faces) // 2
-    spans = [(0.0, faces[0].at_mm), (faces[last].at_mm, faces[second].at_mm), (faces[-1].at_mm, traced.iris_at_mm)]
+    spans = [(pupil, faces[0].at_mm), (faces[last].at_mm, faces[second].at_mm), (faces[-1].at_mm, iris)]
     over = []
     for begin, end in spans:
         over.append(sheet.measure((begin, 0), (end, 0)))
         x, y = sheet.at(((begin + end) / 2, 0))
         over.append(text(x, y - 8, f"{end - begin:.1f} mm", MEASURE, "middle"))
-    for words, z in (("pupil of the eye", 0.0), ("iris", traced.iris_at_mm)):
+    for words, z in (("pupil of the eye", pupil), ("iris", iris)):
         (x, top), (_, bottom) = sheet.at((z, half)), sheet.at((z, -half))
         over += [line(x, top, x, bottom, "measure"), text(x, top - 8, words, "small name", "middle")]
     for words, first, end in (("doublets 75 mm", 0, last), ("doublets 100 mm", second, -1)):

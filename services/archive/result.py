@@ -17,6 +17,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -104,7 +105,7 @@ class ResultFolder:
         An earlier plan is moved to `earlier-plans`; results that both have stay. StoreError if it cannot be written.
         """
         for folder in (self._results, self._quarantine):
-            write_or_raise(folder, lambda folder=folder: atomic_io.make_folder(folder, None))  # type: ignore[misc]
+            write_or_raise(folder, partial(atomic_io.make_folder, folder, None))
         kept = self.root / PLAN
         if kept.is_file() and read_plan(kept) != plan:
             earlier = self.root / EARLIER_PLANS / f"{file_digest(kept)[:12]}.toml"

@@ -8,7 +8,7 @@ from math import atan, cos, radians, sin, tan
 import pytest
 
 from device.optics.light_path import relay_of
-from hardware.parts.dimensions import Dimensions
+from hardware.parts.dimensions import FLANGE_PLATE_MM, Dimensions
 from hardware.parts.pictures import PICTURES
 from hardware.parts.printed import camera_cover, iris, led_cover, plate_lid, retaining_ring, tube_flange
 from tests.project_files import ROOT, text
@@ -79,7 +79,7 @@ def test_screws_on_the_bill_have_the_right_length(d: Dimensions) -> None:
         "M2.5 x 20": (board + camera_cover.ROOM_MM + d.fit.wall_mm - d.cell_rear_z_mm, d.fit.insert_deep_mm),
         "M3 x 16": (d.cell_rear_z_mm - d.cell_front_z_mm, d.fit.insert_deep_mm),
         "M3 x 20": (back + led_cover.ROOM_MM + led_cover.ROOF_MM - d.cap_front_y_mm, d.fit.insert_deep_mm),
-        "M3 x 8": (tube_flange.PLATE_MM, d.fit.insert_deep_mm),
+        "M3 x 8": (FLANGE_PLATE_MM, d.fit.insert_deep_mm),
         "M2 x 8": (plate_lid.THICK_MM, 6.0),
         "M2 x 6": (retaining_ring.FLANGE_MM, 5.0),
     }

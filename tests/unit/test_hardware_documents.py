@@ -19,6 +19,7 @@ from device.optics.light_path import load_light_path, relay_of
 from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm, ring_for_pupil
 from device.optics.ray_trace import Surface
 from device.optics.traced_relay import traced_relay
+from hardware.parts.dimensions import Dimensions
 from services.workshop.light_path_plot import draw_light_path
 from services.workshop.light_report import AXIS_DISTANCE_MM, AXIS_HOLE_MM, at_full_drive, expected_uw
 from tests.drawings import boxes, overlapping
@@ -362,9 +363,9 @@ def test_bill_lists_exactly_the_printed_parts() -> None:
 def test_distances_of_glass_in_the_guide_are_those_of_the_ray_trace() -> None:
     path = load_light_path(HARDWARE / "optics.toml")
     traced, guide = traced_relay(path), " ".join(text("hardware/assembly.md").split())
-    faces, half = traced.lamp_surfaces, len(traced.lamp_surfaces) // 2
-    stop = re.search(r"no nearer to the iris than ([\d.]+) mm", guide)
-    assert stop is not None
+    faces, half, built = traced.lamp_surfaces, len(traced.lamp_surfaces) // 2, Dimensions(path)
+    stop_mm = -built.tube_stop_z_mm
+    between = f"{faces[half].at_mm - faces[half - 1].at_mm:.1f} mm"
     last_mm, along = traced.iris_at_mm - faces[-1].at_mm, path.optics.angular_magnification**2
 
     def rims_mm(left: Surface, right: Surface) -> float:
@@ -374,14 +375,18 @@ def test_distances_of_glass_in_the_guide_are_those_of_the_ray_trace() -> None:
     figures = [
         f"rims {rims_mm(*faces[2:4]):.1f} mm (75) and {rims_mm(*faces[8:10]):.1f} mm (100)",
         f"{rims_mm(*faces[5:7]):.1f} mm from rim to rim",
-        f"are {faces[half].at_mm - faces[half - 1].at_mm:.1f} mm, measured on the axis",
+        f"are {between}, measured on the axis",
+        f"no nearer to the iris than {stop_mm:.1f} mm",
         f"last glass {last_mm:.1f} mm before the iris",
         f"pupil {faces[0].at_mm:.1f} mm before the first glass",
-        f"is {float(stop[1]) - last_mm:.1f} mm more",
+        f"is {stop_mm - last_mm:.1f} mm more",
         f"by {along:.2f} mm towards the glass for each",
-        f"It is {faces[0].at_mm - (float(stop[1]) - last_mm) * along:.1f} mm, within",
+        f"It is {built.pupil_to_glass_mm:.1f} mm, within",
     ]
     assert [figure for figure in figures if figure not in guide] == []
+    assert built.pupil_to_glass_mm == pytest.approx(faces[0].at_mm - (stop_mm - last_mm) * along)
+    shown = re.findall(r">([\d.]+ mm)<", text("hardware/pictures/parts-step-relay.svg"))
+    assert shown == [f"{built.pupil_to_glass_mm:.1f} mm", between, f"{stop_mm:.1f} mm"], "as built, not as laid out"
 
 
 def test_guide_turns_the_lenses_as_the_layout_does() -> None:

@@ -7,7 +7,6 @@ from hardware.parts.printed.splitter_block import tube_screws_mm
 from hardware.parts.shapes import cone, joined, rod, rod_y
 
 UP = (0.0, 0.0, -1.0)
-PLATE_MM = 3.0
 SOCKET_MM = 10.0
 WALL_MM = 4.0  # of the socket: an M3 insert fits through it
 HEAD_MM = 6.4  # countersunk M3
@@ -15,8 +14,7 @@ HEAD_MM = 6.4  # countersunk M3
 
 def tube_z_mm(d: Dimensions) -> tuple[float, float]:
     """From the socket's rim to the plate on which the tube would end: no lens comes nearer to the iris."""
-    rear = d.block_z_mm[0] - PLATE_MM
-    return rear - SOCKET_MM, rear
+    return d.tube_stop_z_mm - SOCKET_MM, d.tube_stop_z_mm
 
 
 def tube_flange(d: Dimensions) -> Part:
