@@ -130,7 +130,9 @@ def run_light(bench: Bench) -> Outcome:
     tiles = (weak.take.truth, weak.bright, weak.human, strong.human)
     shown.append(side_by_side(words, FILE, [(tile, weak.take.inside) for tile in tiles]))
     heads = "a human eye: " + ", ".join(f"{x.light.short_name} ({x.light.mean_e:.0f} e-)" for x in found.values())
-    shown.append(side_by_side(heads, HEADS_FILE, [(one.human, one.take.inside) for one in found.values()]))
+    same_field = {STRONG: weak.take.inside}  # of the same sensor, without the penumbra around it: one scale for all
+    fields = [(one.human, same_field.get(name, one.take.inside)) for name, one in found.items()]
+    shown.append(side_by_side(heads, HEADS_FILE, fields))
     return Outcome(tuple(claims), tuple(shown), (_table(found),), (NOTE,))
 
 
