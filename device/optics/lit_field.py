@@ -31,6 +31,11 @@ def picture_field_deg(spec: InstrumentSpec) -> float | None:
     return max(spec.optics.field_deg, field_to_share_deg(cap, spec.optics.angular_magnification, EDGE_SHARE))
 
 
+def has_sharp_edge(spec: InstrumentSpec) -> bool:
+    """Return whether the field of a head ends within a degree, so that its place and size can be read from a frame."""
+    return cap_of(spec) is None
+
+
 @cache
 def _light_path() -> LightPath:
     return load_light_path(LIGHT_PATH)

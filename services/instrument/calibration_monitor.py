@@ -24,6 +24,7 @@ from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationError, DiffuscopeError, FrameError, StoreError
 from device.head import Head
+from device.optics.lit_field import has_sharp_edge
 from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
 from device.recon.estimation.refraction import RefractionEstimator
@@ -70,7 +71,7 @@ class CalibrationMonitor:
         """
         if self._head.kind == "recording":
             return
-        self._witness = PsfMatchTest(refractor) if refractor is not None else None
+        self._witness = None if refractor is None else PsfMatchTest(refractor, has_sharp_edge(self._head.spec))
         try:
             taken = list(
                 captures_with_calibration(self._store, self._head.calibration.id, in_force_since(self._head.spec))

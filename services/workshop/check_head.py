@@ -15,6 +15,7 @@ from device.clock import Clock
 from device.config.head_file import CalibrationTable, InstrumentSpec
 from device.errors import HeadMismatch
 from device.head import Bench, open_bench
+from device.optics.lit_field import has_sharp_edge
 from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
 from device.recon.estimation.refraction import RefractionEstimator, can_estimate_refraction
 from device.recon.model.fft_plans import Planner
@@ -58,7 +59,7 @@ def check_calibration(spec: InstrumentSpec, data: Path, clock: Clock, progress: 
     captures = _load_captures(spec, kept.calibration.id, data)
     if captures:
         progress(f"looking at {min(len(captures), CHECKED_CAPTURES)} captures of {data}")
-        sights = _sights_of_captures(kept, captures, data)
+        sights = _sights_of_captures(spec, kept, captures, data)
     else:
         progress("no captures with this calibration yet: taking dark frames now")
         sights = _sights_of_darks(spec, kept, clock)
@@ -94,19 +95,20 @@ def _load_captures(spec: InstrumentSpec, calibration_id: str, data: Path) -> lis
         return list(captures_with_calibration(store, calibration_id, in_force_since(spec)))
 
 
-def _sights_of_captures(kept: StoredCalibration, taken: list[Capture], data: Path) -> list[CaptureAssessment]:
-    psf_check = _psf_check(kept.calibration)
+def _sights_of_captures(
+    spec: InstrumentSpec, kept: StoredCalibration, taken: list[Capture], data: Path
+) -> list[CaptureAssessment]:
+    psf_check = _psf_check(spec, kept.calibration)
     with CaptureStore(data) as store:
         found = [exposures(store, capture) for capture in taken[-CHECKED_CAPTURES:]]
     return [assess_capture(kept.calibration, kept.provenance, psf_check, one) for one in found]
 
 
-def _psf_check(calibration: Calibration) -> PsfMatchTest | None:
+def _psf_check(spec: InstrumentSpec, calibration: Calibration) -> PsfMatchTest | None:
     if not can_estimate_refraction(calibration):
         return None
-    return PsfMatchTest(
-        RefractionEstimator(calibration, calibration.psfs[0].shape, Planner(None, effort="FFTW_ESTIMATE"), 0)
-    )
+    planner = Planner(None, effort="FFTW_ESTIMATE")
+    return PsfMatchTest(RefractionEstimator(calibration, calibration.psfs[0].shape, planner, 0), has_sharp_edge(spec))
 
 
 def _sights_of_darks(spec: InstrumentSpec, kept: StoredCalibration, clock: Clock) -> list[CaptureAssessment]:

@@ -21,6 +21,7 @@ from device.calibration.monitoring.head_check import (
 from device.clock import VirtualClock
 from device.config.head_file import CameraSpec, load_head
 from device.errors import CalibrationExpired, CalibrationModeMismatch, CalibrationStale
+from device.optics.lit_field import has_sharp_edge
 from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
 from device.recon.estimation.refraction import RefractionEstimator
@@ -86,6 +87,7 @@ RETINA_SCENES = (
     "diabetic",
     "dim",
     "drifting_eye",
+    "human_eye_imx296_power",
     "paper_heine",
     "short_sighted",
     "small_pupil",
@@ -96,16 +98,17 @@ RETINA_SCENES = (
 
 @pytest.mark.parametrize("name", RETINA_SCENES)
 def test_no_scene_with_a_retina_fails_the_checks(name: str, record_property: Callable[..., None]) -> None:
-    """Small pupils, dim light, moving eyes, stray light, another sensor: the PSF score is 0.80 or more."""
+    """Small pupils, dim light, moving eyes, stray light, another sensor, a field without a sharp edge."""
     spec = coarse(load_head(SCENES / f"{name}.toml"), changed_heads.K)
     world = World(spec, VirtualClock())
     calibration = simulated_calibration(world)
-    psf_check = PsfMatchTest(RefractionEstimator(calibration, world.shape, PLANNER, 0))
+    psf_check = PsfMatchTest(RefractionEstimator(calibration, world.shape, PLANNER, 0), has_sharp_edge(spec))
     seen = ExposurePair(NOW, exposed_counts(world), exposed_counts(world, lit=False), spec.camera.exposure_s)
     findings = head_check.check(calibration, None, [assess_capture(calibration, None, psf_check, seen)], (), NOW)
     record_property("findings", [(one.name, one.value) for one in findings])
     assert {one.name for one in findings if not one.ok} <= {"black level"}  # with room light, or a warm sensor
     assert not any(one.fails for one in findings)
+    assert ({"shift", "width"} <= {one.name for one in findings}) is has_sharp_edge(spec)
     assert next(one.value for one in findings if one.name == "psf") > 0.7
 
 

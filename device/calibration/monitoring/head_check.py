@@ -153,9 +153,16 @@ def _psf_finding(statements: Sequence[PsfMatchResult]) -> Finding:
 
 
 def _field_findings(statements: Sequence[PsfMatchResult]) -> list[Finding]:
-    """Return the findings on shift (degrees) and size (%) of the lit field: lamp, diffuser or sensor may have moved."""
-    down, right = (median(one.field_offset_deg[axis] for one in statements) for axis in (0, 1))
-    wider = median(one.field_radius_change_ratio for one in statements)
+    """Return the findings on shift (degrees) and size (%) of the lit field: lamp, diffuser or sensor may have moved.
+
+    None for a field without a sharp edge.
+    """
+    offsets_deg = [one.field_offset_deg for one in statements if one.field_offset_deg is not None]
+    changes = [one.field_radius_change_ratio for one in statements if one.field_radius_change_ratio is not None]
+    if not offsets_deg or not changes:
+        return []
+    down, right = (median(offset[axis] for offset in offsets_deg) for axis in (0, 1))
+    wider = median(changes)
     return [
         _hint(
             "shift",

@@ -37,14 +37,14 @@ class PsfMatchResult:
 
     M is in dpt, positive for myopia. `field_offset_deg` is the displacement of the illuminated field's centre from the
     sensor's in degrees (down, right); `field_radius_change_ratio` the relative excess of its radius over the
-    calibrated.
+    calibrated. Both are None for a field without a sharp edge, in whose frames neither can be found (OPTICS.md 4.9).
     """
 
     score: float
     sd: float
     sphere_dpt: float
-    field_offset_deg: tuple[float, float]
-    field_radius_change_ratio: float
+    field_offset_deg: tuple[float, float] | None
+    field_radius_change_ratio: float | None
 
     @property
     def upper_limit(self) -> float:
@@ -53,15 +53,20 @@ class PsfMatchResult:
 
 
 class PsfMatchTest:
-    """PSF match test of the frames of one head, with the plans of its `RefractionEstimator`."""
+    """PSF match test of the frames of one head, with the plans of its `RefractionEstimator`.
 
-    def __init__(self, refractor: RefractionEstimator) -> None:
+    `has_edge`: whether the lit field has a sharp edge.
+    """
+
+    def __init__(self, refractor: RefractionEstimator, has_edge: bool = True) -> None:
         self._refractor, self._likelihood = refractor, refractor.likelihood
         bands = self._likelihood.bands
         band = bands.whole
         order = np.argsort(np.hypot(band.rows, band.cols))
         self._rings = np.array_split(order, max(1, order.size // RING))
-        self._rim = FieldEdgeFit(self._likelihood.model, bands.low, bands.high, self._likelihood.taper)
+        self._rim: FieldEdgeFit | None = None
+        if has_edge:
+            self._rim = FieldEdgeFit(self._likelihood.model, bands.low, bands.high, self._likelihood.taper)
 
     def __call__(self, counts: Pixels, dark: Pixels | None, between: Between = lambda: None) -> PsfMatchResult | None:
         """Return the result for a frame (rows, cols) in counts; None without light or with too few usable frequencies.
@@ -85,6 +90,8 @@ class PsfMatchTest:
         sphere_dpt = search.descend(search.grid_search(refractor.step_dpt), refractor.step_dpt / 4)
         unlikelihood(sphere_dpt)  # sets the |H|^2 of the band
         score, sd = self._score(_filled(frame) - np.float32(likelihood.residual(frame, sphere_dpt)), noise)
+        if self._rim is None:
+            return PsfMatchResult(score, sd, sphere_dpt, None, None)
         likelihood.model.refocus(likelihood.otf(likelihood.grid, sphere_dpt))
         edge, per_deg = self._rim.fit(frame.y, between), refractor.geometry.px_per_deg / likelihood.grid.n
         return PsfMatchResult(
