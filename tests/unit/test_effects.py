@@ -592,5 +592,6 @@ def test_the_documents_show_the_plan_as_the_command_prints_it() -> None:
     root = SCENES.parents[2]
     page = (root / "services/research/site/simulation.md").read_text()
     assert format_plan(decide(scene(load_head(SCENES / "calm.toml")))) in page
-    for document in (page, (root / "README.md").read_text()):
-        assert f"has {len(EFFECTS)} effects" in document
+    comparison = (root / "services/research/site/comparison.md").read_text()
+    for document in (page, comparison, (root / "README.md").read_text()):
+        assert f" {len(EFFECTS)} effects" in document
