@@ -69,7 +69,7 @@ class ColourReconstructor:
         }
         self.box = field_box(calibration, shape)
         radius_px, middle = field_radius_px(calibration), ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
-        self._field = disc(shape, middle, radius_px)[self.box] if isfinite(radius_px) else None
+        self._field = disc(shape, middle, radius_px)[self.box].copy() if isfinite(radius_px) else None
         if others and timed:
             noise = np.random.default_rng(0).random(shape, np.float32)
             self._join({reference: noise, **dict.fromkeys(others, noise)}, 1, {})  # measures the cost

@@ -40,6 +40,7 @@ from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
+from services.instrument.allocator import return_freed_arrays
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
@@ -121,6 +122,7 @@ def serve(
     measurement of this device. `updater`: the updater's state folder and its request folder. `uploader`: uploads to the
     receiver. Everything that was opened is closed at every exit. SystemExit(0) for a signal before the server runs.
     """
+    return_freed_arrays()
     clock = SystemClock()
     with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
         data = store.folder  # of a read-only store: its copy in memory
