@@ -12,7 +12,7 @@ import { buttonsChanged } from "./core/taps.js";
 import { startRouter, navigate } from "./core/router.js";
 import { lowerAlerts, endNotice, raiseAlert, syncNotices } from "./core/alerts.js";
 import { render } from "./vendor/lit-html.js";
-import { finishWhenComplete, alertOnError, refreshList, refreshMontages, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
+import { finishWhenComplete, alertOnError, refreshHome, refreshList, refreshMontages, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
 import { loadLanguage, t, today } from "./i18n/translate.js";
 
 /** @typedef {import("./core/state.js").State} State */
@@ -78,7 +78,7 @@ async function loadModule(name) {
 
 async function loadRoute(route) {
   for (const name of MODULES_OF_SCREEN[route.screen] ?? []) loadModule(name);
-  if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
+  if (route.screen === "home") refreshHome();
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
   if (route.screen === "send") refreshOutbox();
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });

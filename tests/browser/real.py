@@ -123,10 +123,10 @@ def small_template(binning: int = BINNING) -> tuple[World, Calibration]:
 
 
 @cache
-def poor_world(cause: str) -> World:
+def poor_world(cause: str, binning: int) -> World:
     """Return the world of a scene of POOR with its light traced."""
     times, keys = POOR[cause]
-    spec = small_template()[0].spec
+    spec = small_template(binning)[0].spec
     assert spec.sim is not None
     world = World(with_keys(spec, peak_e=spec.sim.peak_e * times, **keys), MovableClock())
     world.present_eye("OS")
@@ -164,6 +164,7 @@ class Real:
             "sticks": UsbDrives((folder / "media",), self._mounts),
             "carrier": uploads and HttpsUploader(UploadSettings.model_validate(uploads)),
         }
+        self._binning = binning
         self.rig: Rig = rig_builder(small_template(binning), plans)(folder, self._undo, **parts | options)
         self._serve(self.rig)
 
@@ -271,7 +272,7 @@ class Real:
 
     def show(self, cause: str | None) -> None:
         """Show a scene of POOR from now on; None: the good scene."""
-        self.rig.world.eyes = (poor_world(cause) if cause else small_template()[0]).eyes
+        self.rig.world.eyes = (poor_world(cause, self._binning) if cause else small_template(self._binning)[0]).eyes
 
     @contextmanager
     def frozen(self) -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 import io
 import re
+from datetime import timedelta
 
 import numpy as np
 import pytest
@@ -28,6 +29,23 @@ from tests.browser.walk import (
 from tests.journey.conftest import until
 
 pytestmark = pytest.mark.browser
+
+
+def test_home_continues_an_unfinished_visit_of_yesterday(open_page: Open, real: Real) -> None:
+    real.clock.moved = timedelta(days=-1)
+    visit = real.begin_visit(consent="agreed", sex="woman", age=54)
+    real.clock.moved = timedelta(0)
+    page = open_page(f"{real.url}/#/")
+    expect(page.locator("#continue")).to_contain_text(re.compile(r"\d{4}"))  # with its day
+    expect(page.locator(".home .day")).to_contain_text("0 to finish")  # of today
+    assert look_for_faults(page, "#continue") == []
+    tap(page, "#continue")
+    page.wait_for_url(re.compile(visit["id"]))
+    page.goto(f"{real.url}/#/")
+    real.begin_visit(consent="agreed")
+    page.reload()
+    expect(page.locator(".home .day")).to_contain_text("1 to finish")
+    expect(page.locator("#continue")).not_to_contain_text("·")
 
 
 def screen(page: Page) -> str:

@@ -1,5 +1,6 @@
 // Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
 
+import { today } from "../i18n/translate.js";
 import { newIdempotencyKey, getMontage, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
 import { eyeOf, get, lostShots, missingPictures, otherEyeSlot, moveShot, set, pendingShots } from "./state.js";
 import { navigate } from "./router.js";
@@ -51,6 +52,16 @@ export async function refreshList(query) {
   const result = await alertOnError(() => getVisits(query));
   if (result && get().route.screen === screen && query === newestQuery) set({ visits: result.visits, counts: result.counts });
   return result;
+}
+
+/** Load the counts of today, and the newest unfinished visit of any day: that of yesterday is continued, too. */
+export async function refreshHome() {
+  const query = { day: today(), limit: "1" };
+  newestQuery = query;
+  const found = await alertOnError(() => Promise.all([getVisits(query), getVisits({ open: "true", limit: "1" })]));
+  if (!found || get().route.screen !== "home" || query !== newestQuery) return;
+  const [{ counts }, { visits }] = found;
+  set({ visits, counts });
 }
 
 /** Begin a visit with this number, or with an automatic one. */

@@ -5,7 +5,7 @@ import { icon } from "../components/icons.js";
 import { choice, numberPad, patientLabel } from "../components/components.js";
 import { displayNumber, isNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { clockTime, LANGUAGES, t } from "../i18n/translate.js";
+import { calendarDay, clockTime, LANGUAGES, t, today } from "../i18n/translate.js";
 
 /** @typedef {import("../core/state.js").State} State */
 
@@ -18,7 +18,7 @@ export function home(state, actions) {
       <button class="primary big" type="button" id="new" @click=${() => actions.begin()}>${icon("person")} ${t("home.new")}</button>
       ${unfinished
         ? html`<button class="big" type="button" id="continue" @click=${() => actions.resume(unfinished)}>
-            ${icon("next")} <span>${t("home.continue", { number: displayNumber(unfinished.number) })}</span>
+            ${icon("next")} <span>${t("home.continue", { number: displayNumber(unfinished.number) })}${earlierDay(unfinished)}</span>
           </button>`
         : nothing}
       <div class="pair">
@@ -29,6 +29,9 @@ export function home(state, actions) {
     </section>
   `;
 }
+
+// The day of a visit that was not begun today, so that it is not taken for the present patient's.
+const earlierDay = ({ day }) => (day === today() ? "" : ` · ${calendarDay(`${day}T12:00`)}`);
 
 function dayCounts({ done, to_finish: open, referred, declined }) {
   return html`
