@@ -29,10 +29,10 @@ def test_a_burst_is_lit_throughout_and_dark_afterwards(rig):
 
 def test_a_burst_ends_before_the_guard_would_end_it():
     rig = guarded_rig()
-    shot = ExposureSettings(0.3)
-    light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock), max_on_s=1.0)
+    shot = ExposureSettings(9.0)  # of virtual time; the guard's timer runs in real time, which a frame must not reach
+    light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock), max_on_s=30.0)
     frames = burst(rig.camera, light, Illumination("green"), shot, 16, rig.clock)
-    assert len(frames) == 3  # a fourth one might last until 1.2 s
+    assert len(frames) == 3  # a fourth one might last until 36 s
     assert light.illumination is None
 
 
