@@ -4,14 +4,12 @@ import socket
 import time
 from collections.abc import Iterator
 from threading import Thread
-from typing import Any
 
 import pytest
-import typer
 
-from services.cli import app
-from services.cli import main as run_command
+from services.cli import main
 from services.running_time import FIRST_S
+from tests.parsed_commands import parsed_commands
 
 ASKING = "asks a person between its steps, and prints each"
 STEPS = "prints each step of a computation"
@@ -43,18 +41,8 @@ NOT_ANNOUNCED = {
 }
 
 
-def leaves(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the function of each command of the parser."""
-    if not hasattr(command, "list_commands"):
-        yield " ".join(words), command.callback
-        return
-    context = typer.Context(command)
-    for name in command.list_commands(context):
-        yield from leaves(command.get_command(context, name), (*words, name))
-
-
 def test_every_command_says_what_it_does_or_is_listed_with_a_reason() -> None:
-    silent = {name for name, function in leaves(typer.main.get_command(app)) if not hasattr(function, "announced")}
+    silent = {name for name, function in parsed_commands().items() if not hasattr(function, "announced")}
     assert silent == set(NOT_ANNOUNCED)
 
 
@@ -78,6 +66,6 @@ def slow_server() -> Iterator[str]:
 
 def test_a_check_that_waits_says_so(slow_server: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        run_command(["health", "--at", slow_server])
+        main(["health", "--at", slow_server])
     assert ended.value.code == 1
     assert "asking the instrument: 1 s\n" in capsys.readouterr().err

@@ -24,7 +24,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image as Pillow
-from typer.main import get_command
 
 from device.calibration.archive import Archive
 from device.calibration.procedure.raw_recorder import RawRecorder
@@ -40,7 +39,6 @@ from device.values import Counts, ExposureSettings, Frame, Illumination, Report,
 from services.archive.plan import read_plan
 from services.archive.result import ResultFolder
 from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
-from services.cli import app
 from services.imaging.picture_files import raw_tiff, to_png
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
@@ -56,6 +54,7 @@ from tests.journey.conftest import Rig, coarsened, rig_builder
 from tests.journey.wrong_inputs import call
 from tests.moving_retina import PSF, RETINA, SHAPE, WIDE_RETINA, frame, gaze, seen
 from tests.paper.pictures import plane, side_by_side
+from tests.parsed_commands import parsed_commands
 from tests.simulated import small_head_toml
 from tests.stored_captures import write_store
 from tests.unit.test_archive_adopt import FILE, HERE, NAMES, RAW, adopted, planned, write_results
@@ -605,11 +604,7 @@ ENDPOINTS = {
 
 
 def test_every_command_and_every_endpoint_is_listed() -> None:
-    def names(command: Any, before: str = "") -> Iterator[str]:
-        for name, one in getattr(command, "commands", {}).items():
-            yield from names(one, f"{before}{name} ") if hasattr(one, "commands") else [before + name]
-
-    assert set(names(get_command(app))) == COMMANDS | OTHER_COMMANDS
+    assert set(parsed_commands()) == COMMANDS | OTHER_COMMANDS
     record = json.loads((ROOT / "tests/golden/records/openapi.json").read_text())
     paths = record.get("paths") or record["openapi"]["paths"]
     kinds = ("image/", "application/zip")
