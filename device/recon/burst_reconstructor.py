@@ -13,7 +13,7 @@ import numpy as np
 
 from device.clock import Deadline
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame
-from device.recon.estimation.refraction_task import RefractionTask
+from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, StageResult, Step, noise_frame

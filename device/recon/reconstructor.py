@@ -27,19 +27,19 @@ from device.recon.assessment.image_quality import (
     quality_warnings,
 )
 from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
-from device.recon.estimation.corrected_refraction import corrected
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.power_law_prior import PowerLaw
 from device.recon.estimation.psf_gain import PsfGain
 from device.recon.estimation.psf_warp import Wavefront
-from device.recon.estimation.refraction import (
+from device.recon.estimation.refraction.correction import corrected
+from device.recon.estimation.refraction.estimator import (
     NoRefraction,
     Refraction,
     RefractionEstimator,
     can_estimate_refraction,
 )
-from device.recon.estimation.refraction_notation import report_of, scatter_of
-from device.recon.estimation.refraction_task import RefractionTask
+from device.recon.estimation.refraction.notation import report_of, scatter_of
+from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.compiled import read_only
 from device.recon.model.fft_plans import Planner, Spectrum

@@ -27,7 +27,7 @@ from device.head import Head
 from device.optics.lit_field import has_sharp_edge
 from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction.estimator import RefractionEstimator
 from services.errors import Busy
 from services.imaging.picture_files import read_raw_tiff
 from services.instrument.events import EventBus

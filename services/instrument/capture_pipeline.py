@@ -25,7 +25,7 @@ from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
 from device.recon.estimation.psf_selection import most_likely_psf
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction.estimator import RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.model.kernels import Pixels

@@ -27,8 +27,8 @@ from device.head import Head
 from device.light_safety.burst import require_lit
 from device.optics.light_path import load_light_path
 from device.optics.trial_lens import EMMETROPIC, PowerVector, TrialLens
-from device.recon.estimation.refraction import NoRefraction, RefractionEstimator
-from device.recon.estimation.refraction_notation import report_of
+from device.recon.estimation.refraction.estimator import NoRefraction, RefractionEstimator
+from device.recon.estimation.refraction.notation import report_of
 from device.recon.model.fft_plans import Planner
 from device.values import ExposureSettings, HeadIdentity, Illumination
 

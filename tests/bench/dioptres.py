@@ -11,7 +11,7 @@ from device.calibration.procedure.calibration_sequence import CalibrationJob, Ca
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec
 from device.head import target_placer
-from device.recon.estimation.refraction import Refraction, RefractionEstimator
+from device.recon.estimation.refraction.estimator import Refraction, RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight

@@ -20,7 +20,7 @@ from device.clock import SystemClock, VirtualClock
 from device.config.head_file import load_head
 from device.recon.assessment.metrics import PictureScorer
 from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction.estimator import RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.reconstructor import Recipe, Reconstructor

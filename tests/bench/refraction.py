@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image as Photograph
 
 from device.clock import SystemClock
-from device.recon.estimation.refraction import Refraction, RefractionEstimator
+from device.recon.estimation.refraction.estimator import Refraction, RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import disc
 from device.recon.reconstructor import Reconstructor

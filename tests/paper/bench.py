@@ -15,7 +15,7 @@ from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.recon.assessment.metrics import PictureScorer, Scores
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.refraction import Refraction, RefractionEstimator
+from device.recon.estimation.refraction.estimator import Refraction, RefractionEstimator
 from device.recon.methods import method_named
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px

@@ -12,7 +12,7 @@ from device.config.scene import EyeSpec
 from device.optics.diffuser import Refraction as Wavefront
 from device.optics.diffuser import caustic
 from device.recon.estimation.psf_warp import transform, warped
-from device.recon.estimation.refraction import NoRefraction, Refraction, RefractionEstimator
+from device.recon.estimation.refraction.estimator import NoRefraction, Refraction, RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from device.recon.estimation.psf_warp import transform, warped
-from device.recon.estimation.refraction import NoRefraction, Refraction, RefractionEstimator
-from device.recon.estimation.refraction_notation import report_of
+from device.recon.estimation.refraction.estimator import NoRefraction, Refraction, RefractionEstimator
+from device.recon.estimation.refraction.notation import report_of
 from device.recon.model.fft_plans import Planner
 from device.values import Calibration, Geometry, Psf, Sensor
 from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degrees

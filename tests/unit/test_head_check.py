@@ -24,7 +24,7 @@ from device.errors import CalibrationExpired, CalibrationModeMismatch, Calibrati
 from device.optics.lit_field import has_sharp_edge
 from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction.estimator import RefractionEstimator
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, Counts, Geometry, Psf, Sensor

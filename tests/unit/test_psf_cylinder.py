@@ -10,9 +10,9 @@ from device.recon.colour_reconstructor import psf_wavefront
 from device.recon.estimation.power_law_prior import PowerLaw, band
 from device.recon.estimation.psf_gain import PsfGain
 from device.recon.estimation.psf_warp import Wavefront, transform, warped
-from device.recon.estimation.refraction import Cylinder, NoRefraction, Refraction
-from device.recon.estimation.refraction_burst import FrameScatter
-from device.recon.estimation.refraction_field import FieldEdge
+from device.recon.estimation.refraction.burst import FrameScatter
+from device.recon.estimation.refraction.estimator import Cylinder, NoRefraction, Refraction
+from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.model.fft_plans import Planner
 from device.recon.model.forward_model import Model, otf
 from device.recon.model.grid import Grid

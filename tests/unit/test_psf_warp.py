@@ -6,7 +6,7 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import SettingError
 from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, picture_otf, transform, warped
-from device.recon.estimation.refraction import NoRefraction, RefractionEstimator
+from device.recon.estimation.refraction.estimator import NoRefraction, RefractionEstimator
 from device.recon.estimation.shading import Shading
 from device.recon.model.forward_model import Model, otf
 from device.recon.model.grid import Grid

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from device.recon.estimation.refraction import Cylinder, NoRefraction, Refraction
-from device.recon.estimation.refraction_field import FieldEdge
-from device.recon.estimation.refraction_notation import REFRACTION_KEYS, report_of, sphere_cylinder
+from device.recon.estimation.refraction.estimator import Cylinder, NoRefraction, Refraction
+from device.recon.estimation.refraction.field import FieldEdge
+from device.recon.estimation.refraction.notation import REFRACTION_KEYS, report_of, sphere_cylinder
 
 DPT = st.floats(-8, 8)
 

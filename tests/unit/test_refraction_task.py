@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from device.clock import SystemClock
-from device.recon.estimation.refraction import NoRefraction, Refraction
-from device.recon.estimation.refraction_field import FieldEdge
-from device.recon.estimation.refraction_task import RefractionTask
+from device.recon.estimation.refraction.estimator import NoRefraction, Refraction
+from device.recon.estimation.refraction.field import FieldEdge
+from device.recon.estimation.refraction.task import RefractionTask
 
 EDGE = FieldEdge(33.4, 0.1, 0.0, 0.0, 0.0)
 

@@ -19,10 +19,10 @@ from device.clock import SystemClock, VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import CalibrationRefused, SpecError
 from device.optics.trial_lens import EMMETROPIC, PowerVector, TrialLens, correction_behind
-from device.recon.estimation.corrected_refraction import corrected
-from device.recon.estimation.refraction import Cylinder, Refraction
-from device.recon.estimation.refraction_field import FieldEdge
-from device.recon.estimation.refraction_notation import report_of, sphere_cylinder
+from device.recon.estimation.refraction.correction import corrected
+from device.recon.estimation.refraction.estimator import Cylinder, Refraction
+from device.recon.estimation.refraction.field import FieldEdge
+from device.recon.estimation.refraction.notation import report_of, sphere_cylinder
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Psf, RefractionOffset, Sensor

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon.assessment.field_edge import FieldEdgeFit
-from device.recon.estimation.refraction import LEAST_FREQUENCIES, RefractionEstimator, Search
-from device.recon.estimation.refraction_likelihood import noise_power
+from device.recon.estimation.refraction.estimator import LEAST_FREQUENCIES, RefractionEstimator, Search
+from device.recon.estimation.refraction.likelihood import noise_power
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Linear
 from device.values import Image

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.estimation.refraction_edge import Candidate
-from device.recon.estimation.refraction_likelihood import RINGS, Band
+from device.recon.estimation.refraction.edge import Candidate
+from device.recon.estimation.refraction.likelihood import RINGS, Band
 
 SD_FACTOR = 1.4  # empirical: with it 23 frames have z scores of rms 1.0; neighbouring frequencies are correlated
 SECTORS, RING_GROUPS = 6, 5

@@ -2,7 +2,7 @@
 
 A cropped sensor shows only the inner part of the PSF of a point at the field edge, so that a displaced edge looks like
 another refraction: 0.1 deg of diameter cost 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. So the edge is not
-taken from the calibration. For each candidate eye T the likelihood of `refraction` is minimised over the edge e:
+taken from the calibration. For each candidate eye T the likelihood of `estimator` is minimised over the edge e:
 
     E(T) = min over d of  sum over f of  log S + |R_T - sum_k d_k R_T,k|^2 / S  +  |(e + d - e_calibrated) / PRIOR|^2
 
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
-from device.recon.estimation.refraction_field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
-from device.recon.estimation.refraction_likelihood import SMEAR, TURNS, Band, RefractionLikelihood, noise_power
+from device.recon.estimation.refraction.field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
+from device.recon.estimation.refraction.likelihood import SMEAR, TURNS, Band, RefractionLikelihood, noise_power
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.grid import Pair

@@ -1,8 +1,8 @@
 """Crop-aware refinement of a refraction: Gauss-Newton steps on the likelihood of the frame itself, not of its spectrum.
 
 The lit field is smaller than the blurred frame, so that the frame holds more samples than the retina has unknowns, and
-the wrong PSF leaves a residual that no retina explains. The spectrum alone (`refraction_likelihood`) does not hold
-this. With the model of `refraction_crop_model`, the residual r = y - C h_T * s and the derivatives D of the expected
+the wrong PSF leaves a residual that no retina explains. The spectrum alone (`likelihood`) does not hold
+this. With the model of `crop_model`, the residual r = y - C h_T * s and the derivatives D of the expected
 frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
 
     (D' K^-1 D)^-1 (D' K^-1 r - b)
@@ -19,10 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.estimation.refraction_burst import BurstFrame, frame_steps
-from device.recon.estimation.refraction_crop_model import COVARIANCE_ITERATIONS, CropModel, Fit
-from device.recon.estimation.refraction_edge import EdgeLikelihood
-from device.recon.estimation.refraction_field import FieldEdge
+from device.recon.estimation.refraction.burst import BurstFrame, frame_steps
+from device.recon.estimation.refraction.crop_model import COVARIANCE_ITERATIONS, CropModel, Fit
+from device.recon.estimation.refraction.edge import EdgeLikelihood
+from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.model.fft_plans import Planner
 
 MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual

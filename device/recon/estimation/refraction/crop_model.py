@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
-from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, RealFft, Spectrum
 from device.recon.model.preprocessing import LEAST_GOOD, Linear

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.estimation.refraction_crop_model import CropModel
-from device.recon.estimation.refraction_edge import EdgeLikelihood
-from device.recon.estimation.refraction_field import FieldEdge
+from device.recon.estimation.refraction.crop_model import CropModel
+from device.recon.estimation.refraction.edge import EdgeLikelihood
+from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.model.kernels import Pixels, Places
 
 LEAST_FRAMES = 3  # for a scatter

@@ -1,6 +1,6 @@
-"""Likelihood of an eye's refraction given one frame: the model that `refraction` searches over M.
+"""Likelihood of an eye's refraction given one frame: the model that `estimator` searches over M.
 
-E(M) is defined in `refraction`. One object holds the plans of one calibration and sensor shape, and the state of the
+E(M) is defined in `estimator`. One object holds the plans of one calibration and sensor shape, and the state of the
 frame that `frame` and `fit_smooth` were called with last.
 """
 

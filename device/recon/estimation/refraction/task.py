@@ -5,7 +5,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Lock
 
 from device.clock import Clock
-from device.recon.estimation.refraction import NoRefraction, Refraction, RefractionEstimator
+from device.recon.estimation.refraction.estimator import NoRefraction, Refraction, RefractionEstimator
 from device.recon.model.kernels import Pixels, Places
 
 

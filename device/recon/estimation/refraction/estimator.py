@@ -2,7 +2,7 @@
 
 Defocus and astigmatism stretch the PSF about its axis (see `psf_warp`). The fine structure of |H|^2 is stretched
 inversely; it modulates the power spectrum of every frame. The estimate minimises the negative log likelihood E over
-mean sphere M, cylinder J0, J45 and the field edge e (`refraction_likelihood`, `refraction_edge`, NUMERICS.md 7):
+mean sphere M, cylinder J0, J45 and the field edge e (`likelihood`, `edge`, NUMERICS.md 7):
 
     E(M, J0, J45, e) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_T|^2 + s2
 
@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.psf_warp import Wavefront, picture_otf, transform
-from device.recon.estimation.refraction_burst import LARGEST_STEP_DPT, LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
-from device.recon.estimation.refraction_crop import CropRefinement
-from device.recon.estimation.refraction_cylinder import find_cylinder
-from device.recon.estimation.refraction_edge import EdgeLikelihood
-from device.recon.estimation.refraction_field import FieldEdge
-from device.recon.estimation.refraction_likelihood import RefractionLikelihood
-from device.recon.estimation.refraction_uncertainty import block_of_frequency, quadratic_model
+from device.recon.estimation.refraction.burst import LARGEST_STEP_DPT, LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
+from device.recon.estimation.refraction.crop import CropRefinement
+from device.recon.estimation.refraction.cylinder import find_cylinder
+from device.recon.estimation.refraction.edge import EdgeLikelihood
+from device.recon.estimation.refraction.field import FieldEdge
+from device.recon.estimation.refraction.likelihood import RefractionLikelihood
+from device.recon.estimation.refraction.uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.forward_model import Model

@@ -1,4 +1,4 @@
-"""Search for the cylinder of an eye: M, J0 and J45 of the highest likelihood, from the M of `refraction` on.
+"""Search for the cylinder of an eye: M, J0 and J45 of the highest likelihood, from the M of `estimator` on.
 
 The fine structure of |H|^2 is stretched differently along the two meridians. Without a cylinder in the model M itself
 is off where the eye has one (NUMERICS.md 7).
@@ -7,8 +7,8 @@ is off where the eye has one (NUMERICS.md 7).
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.estimation.refraction_edge import Candidate, EdgeLikelihood
-from device.recon.estimation.refraction_uncertainty import Quadratic, quadratic_model
+from device.recon.estimation.refraction.edge import Candidate, EdgeLikelihood
+from device.recon.estimation.refraction.uncertainty import Quadratic, quadratic_model
 
 CIRCLES_DPT = (0.7, 1.4)  # |J| of the first candidates
 AXES = 8

@@ -12,7 +12,7 @@ Power vector after Thibos, Wheeler and Horner (1997), with a minus cylinder C on
 import math
 from typing import NamedTuple
 
-from device.recon.estimation.refraction import NoRefraction, Refraction
+from device.recon.estimation.refraction.estimator import NoRefraction, Refraction
 
 SCATTER_KEYS = ("frames", "sd_dpt", "stated_sd_dpt", "chi2")
 REFRACTION_KEYS = (

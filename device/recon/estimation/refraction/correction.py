@@ -6,7 +6,7 @@ Only the report is corrected. The PSF of a frame is scaled by the refraction as 
 from dataclasses import replace
 from math import hypot
 
-from device.recon.estimation.refraction import Cylinder, Refraction
+from device.recon.estimation.refraction.estimator import Cylinder, Refraction
 from device.values import RefractionOffset
 
 
