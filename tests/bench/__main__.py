@@ -2,7 +2,7 @@
 
 Absolute times hold for one machine on one day; a ratio within one run shows the overhead of the code. One part alone:
 `python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`, `scaling`,
-`preview` or `viewer`.
+`preview`, `viewer` or `lean`.
 """
 
 import os
@@ -14,11 +14,23 @@ from pathlib import Path
 from device.config.head_file import load_head
 from device.recon.model.fft_plans import Planner, processor_name
 from device.sim.scene_files import simulate_exposure
-from tests.bench import calibration, camera, deadline, fitness, peers, preview, scaling, simulator, speed, viewer
+from tests.bench import calibration, camera, deadline, fitness, lean, peers, preview, scaling, simulator, speed, viewer
 
 PLANS = Path.home() / ".cache" / "diffuscope"
 SCENE = Path("device/sim/scenes/diabetic.toml")
-PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fitness", "scaling", "preview", "viewer")
+PARTS = (
+    "speed",
+    "camera",
+    "deadline",
+    "peers",
+    "simulator",
+    "calibration",
+    "fitness",
+    "scaling",
+    "preview",
+    "viewer",
+    "lean",
+)
 
 
 def main(parts: list[str]) -> None:
@@ -39,10 +51,9 @@ def main(parts: list[str]) -> None:
             part(planner)
     if "scaling" in wanted:
         scaling.scaling(PLANS)
-    if "preview" in wanted:
-        preview.preview()
-    if "viewer" in wanted:
-        viewer.viewer()
+    for name, alone in {"preview": preview.preview, "viewer": viewer.viewer, "lean": lean.lean}.items():
+        if name in wanted:
+            alone()
     print(f"\npeak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
