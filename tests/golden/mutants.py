@@ -396,7 +396,7 @@ MUTANTS: tuple[Mutant, ...] = (
         "raise",
         exam("test_a_capture_without_reconstruction_is_stored"),
     ),
-    Mutant(LOOP, "self._parts.capture_journal.fail(id)", "pass", scenario("camera_stalled")),
+    Mutant(LOOP, " journal.fail(id)", " pass", scenario("camera_stalled")),
     Mutant(JOURNAL, '{press.id}.json", digested', '{press.id}.text", digested', scenario("press")),
     Mutant(
         REQUESTS,
