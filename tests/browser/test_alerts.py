@@ -125,7 +125,7 @@ def test_status_problem_is_shown_until_it_ends(open_page: Open, real: Real) -> N
     expect(page.locator(".state-bar")).to_have_count(0)
     faults.add("camera.mode")
     unknown = real.wait_for_problem("input.frame")  # the page has no text of its own for this code
-    expect(page.locator(".state-bar")).to_contain_text(f"{unknown['message']} {unknown['remedy']}")
+    expect(page.locator(".state-bar")).to_contain_text(f"{unknown['message'].capitalize()}. {unknown['remedy']}")
 
 
 def test_self_check_finding_is_shown_once(open_page: Open, real: Real) -> None:

@@ -2,6 +2,7 @@
 // "state.CODE" in en.js. A blocking alert is shown in the prompt bar and in the shutter ("stop.CODE"), an advisory one
 // as a chip.
 
+import { sentences } from "./api.js";
 import { consentOf, get, lostShots, set } from "./state.js";
 import { calendarDay, has, t } from "../i18n/translate.js";
 
@@ -86,7 +87,7 @@ export function alertText({ code, message, remedy, ...vars }) {
   const key = `state.${code}`;
   const values = translatedValues(vars);
   if (has(key, values)) return t(key, values);
-  return message ? `${message} ${remedy ?? ""}`.trim() : t("fault.unknown");
+  return message ? sentences({ message, remedy }) : t("fault.unknown");
 }
 
 /** @type {(vars: {eye?: string, other?: string, slot?: string, [more: string]: any}) => Record<string, any>} */

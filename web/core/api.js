@@ -14,6 +14,15 @@ export class ApiError extends Error {
   }
 }
 
+/**
+ * Return message and remedy of an error as sentences; the message of the server is a clause without a full stop.
+ * @param {{message: string, remedy?: string}} error
+ */
+export function sentences({ message, remedy }) {
+  const first = message.charAt(0).toUpperCase() + message.slice(1);
+  return `${/[.!?।]$/.test(first) ? first : `${first}.`} ${remedy ?? ""}`.trim();
+}
+
 const RETRY_MS = [300, 1200]; // a reading request that got no answer is repeated after these times
 
 async function answerTo(path, options, waits) {

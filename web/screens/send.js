@@ -1,5 +1,6 @@
 // Send screen: upload queue with the error of each visit, and "try now". Loaded on demand.
 
+import { sentences } from "../core/api.js";
 import { icon } from "../components/icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, has, number, t } from "../i18n/translate.js";
@@ -42,5 +43,5 @@ function outboxItem({ visit, number: who, since, size_bytes: size, tries, error,
 
 function errorLine({ code, message, remedy }, stuck) {
   const known = `why.${code}`;
-  return html`<p class="why">${icon(stuck ? "warn" : "wait")} <span>${has(known) ? t(known) : `${message} ${remedy}`}</span></p>`;
+  return html`<p class="why">${icon(stuck ? "warn" : "wait")} <span>${has(known) ? t(known) : sentences({ message, remedy })}</span></p>`;
 }

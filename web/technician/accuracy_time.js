@@ -2,7 +2,7 @@
 // measured point with the kept picture, and choice of the time limit. The table holds the same values as the plot.
 
 import { html, render, svg } from "../vendor/lit-html.js";
-import { ApiError } from "../core/api.js";
+import { ApiError, sentences } from "../core/api.js";
 import { viewersOf } from "../components/viewer/viewer.js";
 import { clockTime, number, t } from "../i18n/translate.js";
 
@@ -119,7 +119,7 @@ function view(state, actions) {
   return html`
     <h2>${t("explore.title")}</h2>
     <p>${t("explore.says")}</p>
-    ${alert ? html`<p class="bad" role="alert">${alert.message} ${alert.remedy}</p>` : ""}
+    ${alert ? html`<p class="bad" role="alert">${sentences(alert)}</p>` : ""}
     ${paceButtons(explorer, actions)}
     ${measuring(explorer, actions)}
     ${explorer.measured ? points(state, actions) : ""}
@@ -145,7 +145,7 @@ function measuring({ busy, said: progressText, problem, measured }, actions) {
       ${busy ? `${t("explore.busy")} ${progressText}` : measured ? t("explore.when", {
         day: measured.measured_at.slice(0, 10), time: clockTime(measured.measured_at), scene: measured.scene,
       }) : t("explore.never")}
-      ${problem ? html`<span class="bad">${problem.message} ${problem.remedy}</span>` : ""}
+      ${problem ? html`<span class="bad">${sentences(problem)}</span>` : ""}
     </p>
     <button type="button" aria-disabled=${busy} @click=${() => busy || actions.measure()}>${t("explore.measure")}</button>
   `;

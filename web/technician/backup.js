@@ -1,5 +1,6 @@
 // <instrument-backup>: encrypted backup of everything that is stored to a USB stick, and the passphrase that restores it.
 
+import { sentences } from "../core/api.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, t } from "../i18n/translate.js";
 
@@ -29,7 +30,7 @@ class Backup extends HTMLElement {
     const response = await fetch(path, { cache: "no-store", ...options }).catch(() => null);
     const body = await response?.json().catch(() => null);
     if (response?.ok && body) return body;
-    this.#set({ error: body?.message ? `${body.message} ${body.remedy}` : t("backup.failed"), message: "" });
+    this.#set({ error: body?.message ? sentences(body) : t("backup.failed"), message: "" });
     return null;
   }
 
@@ -40,7 +41,7 @@ class Backup extends HTMLElement {
       this.#timer = setTimeout(() => this.#load(), POLL_MS);
       return;
     }
-    const error = backup.error ? `${backup.error.message} ${backup.error.remedy}` : "";
+    const error = backup.error ? sentences(backup.error) : "";
     const { begun, message } = this.#state;
     this.#set({ backup, begun: false, error, message: begun && !error ? t("backup.done", { folder: folderName(backup.last) }) : message });
   }

@@ -1,6 +1,7 @@
 // <instrument-diary>: event log of the instrument, of everything or of one picture; code and details are collapsed.
 // Export as a file or to a USB drive.
 
+import { sentences } from "../core/api.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, t } from "../i18n/translate.js";
 
@@ -24,7 +25,7 @@ class EventLog extends HTMLElement {
     const response = await fetch(path, { cache: "no-store", ...options }).catch(() => null);
     const body = await response?.json().catch(() => null);
     if (response?.ok && body) return body;
-    this.#set({ error: body?.message ? `${body.message} ${body.remedy}` : t("diary.failed"), message: "" });
+    this.#set({ error: body?.message ? sentences(body) : t("diary.failed"), message: "" });
     return null;
   }
 

@@ -1,5 +1,6 @@
 // <stored-pictures>: room on the card; pictures that were exported or sent can be removed, and brought back.
 
+import { sentences } from "../core/api.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
 
@@ -22,7 +23,7 @@ class StoredPictures extends HTMLElement {
     const response = await fetch(path, { method, cache: "no-store" }).catch(() => null);
     const body = await response?.json().catch(() => null);
     if (response?.ok && body) this.#set({ removal: body, asks: false, error: "", message });
-    else this.#set({ asks: false, error: body?.message ? `${body.message} ${body.remedy}` : t("backup.failed"), message: "" });
+    else this.#set({ asks: false, error: body?.message ? sentences(body) : t("backup.failed"), message: "" });
   }
 
   #actions = {
