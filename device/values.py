@@ -278,7 +278,8 @@ class ChannelUse:
     """What became of one colour: shift from the reference channel in pixels (rows, cols), and whether it is predicted.
 
     What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one. `reason`
-    says why a colour is missing in the picture; None for one that the picture has. `white_ratio` is the light of its
+    says why a colour is missing in the picture, and `code` names that reason for programs (an error code, or a CODE of
+    the module that leaves it out); None for one that the picture has. `white_ratio` is the light of its
     frame over that of a white card in the same lamp light; None without a white reference: the hue is then
     neutral, that of an average retina.
     """
@@ -288,6 +289,7 @@ class ChannelUse:
     predicted: bool = False
     reason: str | None = None
     white_ratio: float | None = None
+    code: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,12 @@
 """Colour pictures: other colours of light, solved after the picture in the first one (green) and joined to it.
 
-The picture in green is made first, and as if there were no other colour. What is left of the time budget is for the
-others: each is solved with its own PSF, stretched as green's was for the refraction of the eye, and joined to green on
-green's grid (`colour`). NUMERICS.md 10.4. Raw files without a green one have another first colour, `reference`.
+The picture in green is made first. The others follow: each is solved with its own PSF, stretched as green's was for the
+refraction of the eye, and joined to green on green's grid (`colour`). Green leaves them the time of their first stage,
+and no colour is left out for want of time: the pictures of a visit are in colour, or none is. NUMERICS.md 10.4. Raw
+files without a green one have another first colour, `reference`.
 """
 
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite
 
@@ -23,8 +24,13 @@ from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDon
 from device.recon.white_balance import balanced, white_ratios
 from device.values import ChannelUse, Colour, Geometry, Image, Reconstruction, Report
 
-NO_TIME = "the time budget left no time for this colour"
+NO_PSF = "the calibration has no PSF in this colour of light"
 NOT_REGISTERED = "{} could not be registered: no shift matches better than chance. It is shown where it was taken."
+
+
+def without_psf(colour: Colour) -> ChannelUse:
+    """Return the entry of a report for a colour of which the calibration has no PSF."""
+    return ChannelUse(colour, None, reason=NO_PSF, code="colour.psf")
 
 
 @dataclass(frozen=True)
@@ -82,33 +88,29 @@ class ColourReconstructor:
         *,
         simulated: bool,
         deadline: Deadline | None = None,
-        missing: Mapping[Colour, str] | None = None,
+        missing: Sequence[ChannelUse] = (),
         lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:
         """Yield the steps of `green`, RoundDone after each round of the other colours, and the picture in colour.
 
-        `frames`: those of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason of
-        each colour without a frame; `lights_dn_per_s` the light of each colour at full drive (`white_balance`), None
-        if it is not known: the hue is then neutral. `deadline` is also that of `green`; it moves by the
-        time until the consumer continues after RoundDone. The picture is a ColourReconstruction if another colour was
-        solved; its report lists every colour.
+        `frames`: those of each other colour, (rows, cols), with the dark frame `dark`; `missing` are the
+        colours without a frame, with their reasons; `lights_dn_per_s` the light of each colour at full drive
+        (`white_balance`), None if it is not known: the hue is then neutral. `deadline` moves by the time until the
+        consumer continues after RoundDone; the first stage of each colour runs also after it (`deadline_of_green`). The
+        picture is a ColourReconstruction if another colour was solved; its report lists every colour.
         """
         run = _Run(self, deadline)
         made = yield from run.green(green)
         eye = psf_wavefront(made.report, self._calibration.geometry)
         pictures: dict[Colour, Image] = {self._reference: made.picture}
-        others, reasons = dict[Colour, Report](), dict(missing or {})
+        others, gone = dict[Colour, Report](), list(missing)
         for colour, counts in frames.items():
             try:
                 solved = yield from run.solve(colour, counts, dark, eye)
             except FrameError as error:
-                reasons[colour] = error.message
+                gone.append(ChannelUse(colour, None, reason=error.message, code=error.code))
                 continue
-            if solved is None:
-                reasons[colour] = NO_TIME
-            else:
-                pictures[colour], others[colour] = solved.picture, solved.report
-        gone = tuple(ChannelUse(colour, None, reason=reason) for colour, reason in reasons.items())
+            pictures[colour], others[colour] = solved.picture, solved.report
         if len(pictures) == 1:
             yield replace(made, report=replace(made.report, channels=(ChannelUse(self._reference, (0.0, 0.0)), *gone)))
             return
@@ -120,6 +122,12 @@ class ColourReconstructor:
             made.report, seconds=seconds, channels=(*joined.channels, *gone), warnings=(*made.report.warnings, *notes)
         )
         yield ColourReconstruction(made.picture, report, made.simulated or simulated, joined.picture, others)
+
+    def deadline_of_green(self, deadline: Deadline, colours: Collection[Colour]) -> Deadline:
+        """Return the deadline of the picture in green, earlier by what `colours` take at least, at most by half."""
+        firsts = [self.singles[colour].stages[0] for colour in colours]
+        least_s = sum(first.start_cost.seconds + first.finish_cost.seconds for first in firsts)
+        return deadline.later(-min(least_s + (self.join_cost.seconds if firsts else 0.0), deadline.left_s() / 2))
 
     def _join(self, pictures: Mapping[Colour, Image], n: int, lights_dn_per_s: Mapping[Colour, float]) -> ColourPicture:
         """Return the channels, joined on the lit field only and balanced by the white reference.
@@ -181,20 +189,15 @@ class _Run:
 
     def solve(
         self, colour: Colour, frames: Sequence[Pixels], dark: Pixels | None, eye: Wavefront | None
-    ) -> Generator[Step, None, Reconstruction | None]:
+    ) -> Generator[Step, None, Reconstruction]:
         """Yield RoundDone after each round of one colour, and return its picture; its PSF is that of `eye`.
 
-        None if no time is left for it. FrameError for useless frames.
+        FrameError for useless frames.
         """
         owner = self._owner
-        one, join_s = owner.others[colour], owner.join_cost.seconds
-        first = owner.singles[colour].stages[0]
-        if not self._fits(join_s + first.start_cost.seconds + first.finish_cost.seconds):
-            owner.join_cost.halve_maximum()
-            return None
-        begin_s = owner.clock.now_s()
+        one, begin_s = owner.others[colour], owner.clock.now_s()
         owner.refocus(colour, eye)
-        deadline = None if self._deadline is None else self._deadline.later(-join_s)
+        deadline = None if self._deadline is None else self._deadline.later(-owner.join_cost.seconds)
         if isinstance(one, BurstReconstructor):
             steps = one.steps(frames, dark, simulated=True, deadline=deadline, refract=False)
         else:
@@ -208,9 +211,6 @@ class _Run:
                 self.spent_s += owner.clock.now_s() - begin_s
                 return step
         raise AssertionError("a reconstruction ends with a picture")
-
-    def _fits(self, cost_s: float) -> bool:
-        return self._deadline is None or self._deadline.fits(cost_s)
 
     def _passed_on(self, step: Step) -> Iterator[Step]:
         """Yield a step; the deadline moves by the time until the consumer continues after RoundDone."""

@@ -15,7 +15,7 @@ from device.recon.assessment.exposure_split import ExposureSplit
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import PreparedFrame
-from device.values import EYES, Colour, Eye, Frame, Image, Report
+from device.values import EYES, ChannelUse, Colour, Eye, Frame, Image, Report
 from services.imaging import picture_files
 from services.imaging.colour_rendering import render_colour
 from services.imaging.raw_metadata import RawMetadata
@@ -29,7 +29,7 @@ from services.records.idempotent_requests import key_conflict
 from services.records.json_values import JsonObject
 
 REMEMBERED = 32  # idempotency keys: a request that the network repeats makes one capture
-QUICK_PX = 640
+THUMBNAIL_PX = 640  # also of a quick look
 FRAME_QUALITY = "frame quality"  # begins the reason of a frame that its own verdict keeps out of the picture
 
 
@@ -78,10 +78,10 @@ class ExposedCapture:
 
     `dark`: None if its file was not on the disk. `expose_s`: duration of all exposures. `light`: dose report.
     `verdict`: first verdict, on `frame`. `unusable`: reason of each frame that must not enter the picture, by its
-    index. `colours`: one frame in each other colour of light; `missing`: reason of each that was not taken. `written`
-    waits for the frames that are being written to the disk, and returns their files by the number of the frame.
-    `notes`: warnings on the exposure for the report. `prepared`: what was prepared of the frames during the exposure,
-    by their index.
+    index. `colours`: one frame in each other colour of light; `missing`: each that was not taken, with the reason.
+    `written` waits for the frames that are being written to the disk, and returns their files by the number of the
+    frame. `notes`: warnings on the exposure for the report. `prepared`: what was prepared of the frames during the
+    exposure, by their index.
     """
 
     press: Press
@@ -94,7 +94,7 @@ class ExposedCapture:
     verdict: Verdict
     unusable: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[Colour, Frame] = field(default_factory=dict)
-    missing: Mapping[Colour, str] = field(default_factory=dict)
+    missing: tuple[ChannelUse, ...] = ()
     written: Callable[[], Mapping[int, WrittenFile]] = dict
     notes: tuple[str, ...] = ()
     prepared: Mapping[int, PreparedFrame] = field(default_factory=dict)
@@ -155,25 +155,29 @@ def colour_name(colour: Colour) -> str:
 
 
 def capture_files(
-    capture: Capture, head: str, shot: ExposedCapture, shown: Image, quick: bytes | None, colour: Image | None
+    capture: Capture, head: str, shot: ExposedCapture, shown: Image, colour: Image | None
 ) -> dict[str, FileContent]:
-    """Return the files of a capture by name; `shown` is the linear picture of the field, `quick` its quick look (JPEG).
+    """Return the files of a capture by name; `shown` is the linear picture of the field.
 
-    `colour` is the picture in colour, if there is one. `head` is the name of the head. The raw frames and the
+    `colour` is the picture in colour, if there is one: `colour.png`, and reduced `quick.jpg`. The picture in green is
+    `picture.png`, and reduced `green.jpg`, without colour also `quick.jpg`. `head` is its name. The raw frames and the
     calibration in their metadata suffice to repeat the reconstruction: `raw.tiff` is the first frame of the burst,
     `raw-1.tiff` the next one, `raw-red.tiff` that in red light; without a dark frame there is no `dark.tiff`.
     """
     note = f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
+    green = picture_files.to_jpeg(shown, THUMBNAIL_PX, capture.simulated)
+    thumbnail, coloured = green, dict[str, FileContent]()
     predicted = [one.name for one in capture.report.reconstruction.channels if one.predicted]
-    coloured: dict[str, FileContent] = {}
     if colour is not None:
         colour = render_colour(colour)
         coloured[COLOUR] = picture_files.to_png(colour, capture.simulated, note, predicted, picture_files.DISPLAY)
+        thumbnail = picture_files.to_jpeg(colour, THUMBNAIL_PX, capture.simulated, window=picture_files.DISPLAY)
     return {
         **_frame_files(capture, head, shot),
         "picture.png": picture_files.to_png(shown, capture.simulated, note),
         **coloured,
-        "quick.jpg": quick or picture_files.to_jpeg(shown, QUICK_PX, capture.simulated),
+        "green.jpg": green,
+        "quick.jpg": thumbnail,
         "report.json": as_json(report_as_json(capture.report) | {"simulated": capture.simulated}),
     }
 

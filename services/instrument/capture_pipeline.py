@@ -23,7 +23,7 @@ from device.recon.assessment.exposure_split import WHOLE, ExposureSplit, PressLi
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
-from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
+from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor, without_psf
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction.estimator import RefractionEstimator
 from device.recon.model.fft_plans import Planner
@@ -34,6 +34,7 @@ from device.recon.white_balance import light_dn_per_s
 from device.values import (
     EYES,
     Calibration,
+    ChannelUse,
     Colour,
     Counts,
     ExposureSettings,
@@ -56,7 +57,6 @@ log = logging.getLogger(__name__)
 
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
-NO_PSF = "the calibration has no PSF in this colour of light"
 INTERRUPTED = "the instrument stopped before this frame was on the disk"
 
 Taken = Callable[[Frame, float, float], None]  # frame, dose and duration of the press until its read-out
@@ -116,6 +116,9 @@ class ColoursReconstructor(Protocol):
     def others(self) -> Collection[Colour]:
         """Colours that can be reconstructed."""
 
+    def deadline_of_green(self, deadline: Deadline, colours: Collection[Colour]) -> Deadline:
+        """Return the deadline of the picture in green, earlier by what `colours` take at least."""
+
     def steps(
         self,
         green: Iterator[Step],
@@ -124,7 +127,7 @@ class ColoursReconstructor(Protocol):
         *,
         simulated: bool,
         deadline: Deadline | None = None,
-        missing: Mapping[Colour, str] | None = None,
+        missing: Sequence[ChannelUse] = (),
         lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:
         """Yield the steps of `green`, ROUND_DONE after each round of other colours, and the picture with colours."""
@@ -155,7 +158,7 @@ class Exposure:
 
     `dark` is None if an interrupted press has none. `begin_s` (clock seconds) and `duration_s` are those of all
     exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
-    picture, by its index; `missing` the reason of each other colour that was not taken; `split` how the exposures of
+    picture, by its index; `missing` each other colour that was not taken, with the reason; `split` how the exposures of
     the lit frames were split; `overhead_s` what a lit frame took longer than its exposure, at most, None if this run
     did not expose it; `ready` what was prepared of the frames during the exposure, by their numbers.
     """
@@ -167,7 +170,7 @@ class Exposure:
     duration_s: float
     dose_j_per_cm2: float
     unusable: Mapping[int, str] = field(default_factory=dict)
-    missing: Mapping[Colour, str] = field(default_factory=dict)
+    missing: tuple[ChannelUse, ...] = ()
     split: ExposureSplit = WHOLE
     overhead_s: float | None = None
     ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
@@ -195,12 +198,12 @@ class CaptureRecord:
     head: str
     colour: Image | None = None
 
-    def files(self, quick: bytes | None) -> dict[str, FileContent]:
-        """Return the files by name; `quick` is the quick look (JPEG), if one was made.
+    def files(self) -> dict[str, FileContent]:
+        """Return the files by name.
 
         Waits until the frames of the press are on the disk, or have failed to be.
         """
-        return capture_files(self.capture, self.head, self.shot, self.shown, quick, self.colour)
+        return capture_files(self.capture, self.head, self.shot, self.shown, self.colour)
 
 
 class CapturePipeline:
@@ -245,7 +248,7 @@ class CapturePipeline:
         """
         count, split = (count, split) if self.bursts is not None else (1, WHOLE)
         unable = self._unable(colours)
-        able = [] if self.colours is None else [colour for colour in colours if colour not in unable]
+        able = [] if self.colours is None else [one for one in colours if one in self.colours.others]
         run = partial(
             expose,
             self._head,
@@ -269,7 +272,7 @@ class CapturePipeline:
 
                 exposure = run(taken=read_out)
                 exposure = replace(exposure, ready=preparation.finish())
-        return replace(exposure, missing={**unable, **exposure.missing})
+        return replace(exposure, missing=(*unable, *exposure.missing))
 
     def choose_split(self, count: int) -> ExposureSplit:
         """Return the split of the `count` exposures of the next press while the eye moves.
@@ -287,15 +290,18 @@ class CapturePipeline:
         if self.colours is None:
             return replace(taken, colours={})
         unable = self._unable(colours)
-        lost = {one: INTERRUPTED for one in colours if one not in taken.colours}
+        lost = [
+            ChannelUse(one, None, reason=INTERRUPTED, code="colour.interrupted")
+            for one in colours
+            if one not in taken.colours and one in self.colours.others
+        ]
         able = {colour: frame for colour, frame in taken.colours.items() if colour in self.colours.others}
-        return replace(taken, colours=able, missing={**lost, **unable})
+        return replace(taken, colours=able, missing=(*lost, *unable))
 
-    def _unable(self, colours: Sequence[Colour]) -> dict[Colour, str]:
-        """Return the reason of each of `colours` that the pipeline cannot reconstruct; none without other colours."""
-        if self.colours is None:
-            return {}
-        return {colour: NO_PSF for colour in colours if colour not in self.colours.others}
+    def _unable(self, colours: Sequence[Colour]) -> tuple[ChannelUse, ...]:
+        """Return each of `colours` that the pipeline cannot reconstruct; none without other colours."""
+        able = colours if self.colours is None else self.colours.others
+        return tuple(without_psf(one) for one in colours if one not in able)
 
     def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
         """Return the exposure with its first good frame at the front, and the verdict on that frame.
@@ -342,13 +348,15 @@ class CapturePipeline:
             yield unreconstructed(shot.frame, error)
 
     def _steps(self, shot: ExposedCapture, deadline: Deadline) -> Iterator[Step]:
-        dark, simulated = counts_of(shot.dark), shot.frame.simulated
+        dark, simulated, of_green = counts_of(shot.dark), shot.frame.simulated, deadline
+        if self.colours is not None:
+            of_green = self.colours.deadline_of_green(deadline, shot.colours)
         if self.bursts is None:
-            green = self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
+            green = self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=of_green)
         else:
             counts = [frame.counts for frame in shot.frames]
             green = self.bursts.steps(
-                counts, dark, simulated=simulated, deadline=deadline, unusable=shot.unusable, prepared=shot.prepared
+                counts, dark, simulated=simulated, deadline=of_green, unusable=shot.unusable, prepared=shot.prepared
             )
         if self.colours is None or not (shot.colours or shot.missing):
             return green
@@ -550,10 +558,10 @@ class _Exposing:
             taken=self.report,
         )
 
-    def colours(self, colours: Sequence[Colour]) -> tuple[dict[Colour, Frame], dict[Colour, str]]:
-        """Return one frame in each of `colours`, and the reason of each that could not be taken."""
+    def colours(self, colours: Sequence[Colour]) -> tuple[dict[Colour, Frame], tuple[ChannelUse, ...]]:
+        """Return one frame in each of `colours`, and each that could not be taken, with the reason."""
         taken: dict[Colour, Frame] = {}
-        missing: dict[Colour, str] = {}
+        missing: list[ChannelUse] = []
         whole = ExposureSettings(self._head.spec.camera.exposure_s)
         if colours:
             self._head.camera.prepare(whole)  # in the dark: a sensor may take some frames to change its exposure
@@ -562,8 +570,8 @@ class _Exposing:
                 (taken[colour],) = self.lit(self._head.light.hazard.brightest(colour), whole)
             except DiffuscopeError as error:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})
-                missing[colour] = error.message
-        return taken, missing
+                missing.append(ChannelUse(colour, None, reason=error.message, code=error.code))
+        return taken, tuple(missing)
 
 
 def expose_live(

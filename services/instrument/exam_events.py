@@ -9,7 +9,7 @@ from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.values import Image
 from services.imaging import picture_files
-from services.instrument.capture import QUICK_PX, Press, Preview
+from services.instrument.capture import THUMBNAIL_PX, Press, Preview
 from services.instrument.events import EventBus
 from services.instrument.exam_requests import ExamOutput, ExamRequests
 from services.instrument.progress import Progress, ProgressEstimate
@@ -57,7 +57,7 @@ class ExamEvents:
         With `is_exposing` it remains in its stage: the next frames are being exposed. The thread of the preparation
         calls this then, while the thread `head` publishes nothing.
         """
-        jpeg, before = picture_files.to_jpeg(look, QUICK_PX, simulated), self.output.quick_looks.get(id)
+        jpeg, before = picture_files.to_jpeg(look, THUMBNAIL_PX, simulated), self.output.quick_looks.get(id)
         # Where the first frame is not the reference the page has the look of another frame: a new URL replaces it.
         url = f"/api/captures/{id}/quick.jpg" + ("" if before in (None, jpeg) else "?reference")
         self._show_quick_looks({**self.output.quick_looks, id: jpeg})

@@ -246,8 +246,8 @@ class ExamLoop:
             self._events.verdict(shot.id, verdict)  # a failed reconstruction is published with the stored capture
         record = self._pipeline.record(shot, made, verdict, budget_s)
         self._events.stage(shot.press, shot.id, "keep")
-        quick, target = self._events.output.quick_looks.get(shot.id), shot.press.target
-        files, deadline = record.files(quick), Deadline.after(self._parts.clock, LOCK_PATIENCE_S)
+        target = shot.press.target
+        files, deadline = record.files(), Deadline.after(self._parts.clock, LOCK_PATIENCE_S)
         kept = _when_unlocked(
             lambda: self._parts.store.save(record.capture, files, target.write_rows, target.request),
             lambda: self._serve_between_rounds(shot),

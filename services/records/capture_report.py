@@ -107,7 +107,8 @@ def _frame_as_json(one: FrameUse) -> JsonValue:
 def _channel_as_json(one: ChannelUse) -> JsonValue:
     shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
     entries = {"name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason}
-    return entries if one.white_ratio is None else entries | {"white_ratio": one.white_ratio}
+    known = {"white_ratio": one.white_ratio, "code": one.code}
+    return entries | {name: value for name, value in known.items() if value is not None}
 
 
 def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
@@ -194,7 +195,7 @@ def _reconstruction(entries: JsonObject) -> Report:
         quality=_lenient(entries, "quality", _copied, {}),
         warnings=_lenient(entries, "warnings", _texts, ()),
         frames=_lenient(entries, "frames", _frames, ()),
-        channels=_lenient(entries, "channels", _channels, ()),
+        channels=_lenient(entries, "channels", read_channels, ()),
     )
 
 
@@ -210,7 +211,8 @@ def _frame(entries: JsonObject) -> FrameUse:
     return FrameUse(index, used, shift_px, weight, _checked(entries, "reason", text, None))
 
 
-def _channels(value: object) -> tuple[ChannelUse, ...]:
+def read_channels(value: object) -> tuple[ChannelUse, ...]:
+    """Return the channels of a report with this JSON content; ValueError for a wrong type."""
     if not isinstance(value, list):
         raise ValueError("channels that are no list")
     return tuple(_channel(_object(one)) for one in value)
@@ -220,7 +222,7 @@ def _channel(entries: JsonObject) -> ChannelUse:
     name = one_of(entries.get("name"), *get_args(Colour))
     shift_px, predicted = _checked(entries, "shift_px", _position, None), entries.get("predicted") is True
     reason, white_ratio = _checked(entries, "reason", text, None), _checked(entries, "white_ratio", _number, None)
-    return ChannelUse(name, shift_px, predicted, reason, white_ratio)
+    return ChannelUse(name, shift_px, predicted, reason, white_ratio, _checked(entries, "code", text, None))
 
 
 def _dose_report(entries: JsonObject) -> DoseReport:

@@ -1,6 +1,6 @@
 """Removal of large files of captures whose visit was exported or sent; it can be undone until their space is needed.
 
-    captures/<id>/removed.json    why and when the files were removed; report and quick look stay
+    captures/<id>/removed.json    why and when the files were removed; report and thumbnails stay
     removed/<n>-<id>/             the files, the oldest removal first, until a new capture needs their space
 
 The mark is written before the first file is moved and deleted after the last one is back, and a reader looks for a file

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal, cast
 
-from device.values import Eye
-from services.records.capture import PictureVerdict
+from device.values import ChannelUse, Eye
+from services.records.capture import NO_METHOD, PictureVerdict
 from services.records.json_values import FormValue
 from services.records.protocol import VISIONS, Protocol, Vision
 
+GREEN_ONLY = "colour.none"  # no other colour was asked for, or the head has none
 EYE_WORDS = {"OD": "right", "OS": "left"}
 URGENT_COMPLAINTS = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
 OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "declined", "send"]
@@ -17,10 +18,14 @@ OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "declined"
 
 @dataclass(frozen=True)
 class SlotCapture:
-    """One capture of a slot: capture id, and the verdict on its image quality (None: no verdict)."""
+    """One capture of a slot: capture id, and the verdict on its image quality (None: no verdict).
+
+    `no_colour`: code of the reason why it has no picture in colour; None if it has one, or no picture at all.
+    """
 
     capture: str
     verdict: PictureVerdict | None
+    no_colour: str | None = None
 
     @property
     def is_good(self) -> bool:
@@ -89,6 +94,26 @@ class Visit:
     def next_slot(self) -> str | None:
         """Return the id of the first empty slot in the order of the protocol; None if there is none."""
         return next((id for id, slot in self.slots.items() if slot.state == "empty"), None)
+
+    @property
+    def no_colour(self) -> str | None:
+        """Return why the pictures of the visit are shown in green light: the code of a capture that has no colour.
+
+        None if every capture is in colour: a visit is shown in colour as a whole, or not at all.
+        """
+        codes = [one.no_colour for slot in self.slots.values() for one in slot.captures if one.no_colour is not None]
+        return next((code for code in codes if code != GREEN_ONLY), codes[0] if codes else None)
+
+
+def no_colour_of(method: str, channels: Sequence[ChannelUse]) -> str | None:
+    """Return the code of the reason why a capture has no picture in colour; None if it has one, or no picture.
+
+    `method`, `channels`: of its report.
+    """
+    others = [one for one in channels if one.name != "green" and not one.predicted]
+    if method == NO_METHOD or any(one.reason is None for one in others):
+        return None
+    return next((one.code or GREEN_ONLY for one in others), GREEN_ONLY)
 
 
 def decision_after(slot: SlotState, new: SlotCapture) -> SlotDecision | None:

@@ -53,6 +53,7 @@ class VisitPictures:
         permit = self.permission(id)
         permit()
         tries = len(visit.slots[slot].captures)
+        colours = self._protocol.colours if visit.no_colour is None else ()  # light that is not shown is not given
         return CaptureTarget(
             id,
             slot,
@@ -63,7 +64,7 @@ class VisitPictures:
             request,
             permit,
             self._protocol.frames,
-            self._protocol.colours,
+            colours,
         )
 
     def resumed_target(self, interrupted: ResumableCapture) -> CaptureTarget:

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import row_validation
-from services.records.capture_report import read_verdict
+from services.records.capture_report import read_channels, read_verdict
 from services.records.protocol import Protocol
 from services.records.record_rows import visit_contents
 from services.records.record_signing import refuse_changed
@@ -30,7 +30,7 @@ from services.records.schema import (
     SlotDecisionRow,
     VisitRow,
 )
-from services.records.visit import Outcome, OutcomeCode, SlotCapture, SlotDecision, SlotState, Visit
+from services.records.visit import Outcome, OutcomeCode, SlotCapture, SlotDecision, SlotState, Visit, no_colour_of
 
 PAGE_ROWS = 500  # visits per query where all visits are read
 _ID = re.compile(r"[0-9A-Za-z-]{1,60}", re.ASCII)
@@ -180,14 +180,16 @@ def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, s
     return {row.id: out[row.id] | known[row.patient] for row in rows}
 
 
-def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[object, object]]]:
-    """Return (capture id, verdict as JSON text or None) of each capture by (visit, slot), oldest first."""
+def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[object, ...]]]:
+    """Return (id, verdict, method, channels) of each capture by (visit, slot), oldest first; JSON texts or None."""
     query = (
         select(
             CaptureSlotRow.visit,
             func.coalesce(CaptureRow.slot, CaptureSlotRow.slot),  # a capture with a damaged row keeps its slot
             CaptureSlotRow.capture,
             CaptureRow.verdict,
+            row_validation.json_extract_or_null(CaptureRow.report, "$.method"),
+            row_validation.json_extract_or_null(CaptureRow.report, "$.channels"),
         )
         .outerjoin(
             CaptureRow, CaptureRow.id == CaptureSlotRow.capture
@@ -195,19 +197,27 @@ def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[obj
         .where(CaptureSlotRow.visit.in_(ids))
         .order_by(CAPTURE_ROWID)
     )
-    out: dict[SlotKey, list[tuple[object, object]]] = defaultdict(list)
-    for visit, slot, capture, verdict_json in session.execute(query):
-        out[visit, slot].append((capture, verdict_json))
+    out: dict[SlotKey, list[tuple[object, ...]]] = defaultdict(list)
+    for visit, slot, *stored in session.execute(query):
+        out[visit, slot].append(tuple(stored))
     return out
 
 
-def _taken_capture(capture: object, verdict_json: object) -> SlotCapture:
-    """Return a capture of a slot; its verdict is None if it is missing or unreadable; ValueError for an invalid id."""
+def _taken_capture(capture: object, verdict_json: object, method: object, channels_json: object) -> SlotCapture:
+    """Return a capture of a slot; ValueError for an invalid id.
+
+    A verdict that is missing or unreadable is None; so is `no_colour` with a report that is.
+    """
     try:
         verdict = None if verdict_json is None else read_verdict(row_validation.parsed_json(verdict_json))
     except (ValueError, TypeError, KeyError):
         verdict = None
-    return SlotCapture(row_validation.text(capture), verdict)
+    try:
+        channels = () if channels_json is None else read_channels(row_validation.parsed_json(channels_json))
+        no_colour = None if method is None else no_colour_of(row_validation.text(method), channels)
+    except (ValueError, TypeError, KeyError):
+        no_colour = None
+    return SlotCapture(row_validation.text(capture), verdict, no_colour)
 
 
 def _decided(session: Session, ids: Sequence[str]) -> dict[SlotKey, SlotDecisionRow]:

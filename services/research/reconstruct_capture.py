@@ -17,14 +17,14 @@ from device.errors import FrameError
 from device.recon.assessment.exposure_split import dark_fits
 from device.recon.assessment.image_quality import NO_SIGNAL
 from device.recon.burst_reconstructor import BurstReconstructor
-from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
+from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor, without_psf
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
 from device.recon.white_balance import light_dn_per_s
-from device.values import Calibration, Colour, FrameUse, Image, Psf, Reconstruction, Report
+from device.values import Calibration, ChannelUse, Colour, FrameUse, Image, Psf, Reconstruction, Report
 from services.research.burst_frames import common_raw, refuse_other_size, rejections, unusable_raws, without_bad
 from services.research.reconstruct_file import (
     FileReconstruction,
@@ -49,7 +49,6 @@ from services.research.reconstruct_inputs import (
 )
 
 KEPT_PLANS = 2  # each has the solvers of a burst and of the other colours
-NO_PSF = "the calibration has no PSF in this colour of light"
 Box = tuple[slice, slice]
 
 
@@ -211,7 +210,7 @@ class CaptureReconstructor:
 
     def _of_colour(
         self, name: Colour, loaded: LoadedRaw, whole: Calibration, reference: Calibration
-    ) -> Calibration | str:
+    ) -> Calibration | ChannelUse:
         """Return the calibration of another colour, `reference` if its PSF holds for any colour, or why none fits.
 
         It is that of the instrument: PSFs of that colour, else those that hold for any colour.
@@ -221,7 +220,7 @@ class CaptureReconstructor:
         measured = {psf.colour for psf in whole.psfs}
         if name in measured:
             return whole.for_colour(name)
-        return reference if None in measured else NO_PSF
+        return reference if None in measured else without_psf(name)
 
     def _calibration(self, options: ReconstructOptions, common: LoadedRaw) -> tuple[Calibration, tuple[str, ...]]:
         """Return the calibration of the options for a raw, and notes about the files of the PSFs."""
@@ -289,7 +288,7 @@ class _CaptureSolvers:
         self,
         options: ReconstructOptions,
         reference: Calibration,
-        others: Mapping[Colour, Calibration | str],
+        others: Mapping[Colour, Calibration | ChannelUse],
         frames: CaptureFrames,
         planner: Planner,
         index: int,
@@ -299,7 +298,7 @@ class _CaptureSolvers:
         self.single = plan_reconstructor(options, reference, shape, planner, index, quick=len(frames.lit) > 1)
         self._lit = self._of_frames(self.single, len(frames.lit))
         like_first = replace(options, bin=self.single.stages[-1].recipe.bin)
-        self._missing = {name: why for name, why in others.items() if isinstance(why, str)}
+        self._missing = [own for own in others.values() if isinstance(own, ChannelUse)]
         solvers: dict[Colour, Reconstructor | BurstReconstructor] = {}
         for name, own in others.items():
             count = len(frames.colours[name])
@@ -334,13 +333,16 @@ class _CaptureSolvers:
         deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
         order = sorted(range(len(lit)), key=lambda k: k in unusable)  # the first one must be usable
         reasons = {place: unusable[k] for place, k in enumerate(order) if k in unusable}
+        solved = {} if self._colours is None else {one: others[one] for one in others if one in self._colours.others}
+        of_green = deadline
+        if self._colours is not None and deadline is not None:
+            of_green = self._colours.deadline_of_green(deadline, solved)
         if isinstance(self._lit, BurstReconstructor):
             ordered = [lit[k] for k in order]
-            steps = self._lit.steps(ordered, dark, simulated=False, deadline=deadline, unusable=reasons)
+            steps = self._lit.steps(ordered, dark, simulated=False, deadline=of_green, unusable=reasons)
         else:
-            steps = self._lit.steps(lit[0], dark, simulated=False, deadline=deadline)
+            steps = self._lit.steps(lit[0], dark, simulated=False, deadline=of_green)
         if self._colours is not None:
-            solved = {name: counts for name, counts in others.items() if name not in self._missing}
             first = {self._light: lit[order[0]], **{name: given[0] for name, given in solved.items()}}
             steps = self._colours.steps(
                 steps,

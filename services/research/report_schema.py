@@ -121,6 +121,11 @@ CHANNEL: Mapping[str, JsonValue] = {
         "type": ["string", "null"],
         "description": "Why the picture has not this colour; null for one that it has.",
     },
+    "code": {
+        "type": ["string", "null"],
+        "description": "Name of this reason for programs: the code of an error, colour.psf (no PSF of this colour) or "
+        "colour.interrupted; null for a colour that the picture has.",
+    },
     "white_ratio": {
         "type": ["number", "null"],
         "description": "Light of its frame over that of a white card in the same lamp light. Null without a white "

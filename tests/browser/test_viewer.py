@@ -3,6 +3,8 @@
 import io
 import re
 from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser, Locator, Page, Route, expect
 
-from tests.browser.conftest import CHROMIUM, Complaints
+from device.head import Head
+from tests.browser.conftest import CHROMIUM, Complaints, MakeReal
 from tests.browser.pictures import drawn_retina, show_colour_pictures
 from tests.browser.real import Real
 from tests.browser.walk import (
@@ -23,8 +26,11 @@ from tests.browser.walk import (
     take_picture,
     tap,
     visit_of,
+    wait_for_preview,
     wait_until_drawn,
 )
+from tests.journey.asking import with_all_chips
+from tests.red_light import FailsInRed
 
 pytestmark = pytest.mark.browser
 
@@ -38,6 +44,14 @@ PIXEL = """(pic, [dx, dy]) => {
     const c = pic.querySelector("canvas");
     const { data } = c.getContext("2d").getImageData(c.width / 2 + dx * c.height, c.height / 2 + dy * c.height, 1, 1);
     return [...data].slice(0, 3);
+}"""
+
+GREYNESS = """(image) => {
+    const c = document.createElement("canvas");
+    [c.width, c.height] = [image.naturalWidth, image.naturalHeight];
+    c.getContext("2d").drawImage(image, 0, 0);
+    const { data } = c.getContext("2d").getImageData(c.width / 2, c.height / 2, 1, 1);
+    return Math.max(...data.slice(0, 3)) - Math.min(...data.slice(0, 3));
 }"""
 
 
@@ -418,6 +432,45 @@ def test_viewer_module_is_loaded_on_demand_and_retried(open_page: Open, real: Re
     after_debounce(page)
     take_picture(page)  # properties that were set before the module was loaded take effect
     expect(page.locator("#picture")).to_have_attribute("data-painter", "gl")
+
+
+def test_a_visit_with_one_picture_without_colour_is_shown_in_green_and_says_why(
+    open_page: Open, make_real: MakeReal
+) -> None:
+    """Picture, thumbnails and list: the first picture is in colour until the second one has none."""
+    cameras: list[FailsInRed] = []
+
+    def failing(head: Head) -> Head:
+        cameras.append(FailsInRed(head.camera))
+        return replace(with_all_chips(head, datetime.now(UTC)), camera=cameras[-1])
+
+    real, why = make_real(head=failing), "Shown in green: the colour of one picture failed."
+    camera = cameras[-1]
+    page = aiming(open_page, real, reduced_motion="reduce")
+    take_picture(page)
+    wait_until_drawn(page, "colour 0 0")
+    expect(page.locator(".prompt")).to_contain_text("Final picture, kept")
+    expect(page.locator(".prompt")).not_to_contain_text("green")
+    first = page.locator("[data-slot=R-centre] img")
+    expect(first).to_have_attribute("src", re.compile("/quick.jpg$"))
+    camera.fails = True
+    tap(page, "#next")
+    wait_for_preview(page)
+    take_picture(page)
+    expect(page.locator(".prompt")).to_contain_text(f"Final picture, kept · {why}")
+    for slot in ("R-centre", "R-nerve"):
+        expect(page.locator(f"[data-slot={slot}] img")).to_have_attribute("src", re.compile("/green.jpg$"))
+    expect(page.get_by_role("button", name="Colour")).to_have_count(0)
+    tap(page, "[data-slot=R-centre]")
+    expect(page.locator(".prompt")).to_contain_text(why)
+    wait_until_drawn(page, "colour 0 0")
+    red, green, blue = pixel(page.locator("#picture"))
+    assert red == green == blue, "the first picture follows its visit"
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/film")
+    expect(page.locator("#green")).to_have_text(why)
+    thumbnail = page.locator(".film .thumb img").first
+    expect(thumbnail).to_have_js_property("complete", True)
+    assert thumbnail.evaluate(GREYNESS) < 2
 
 
 def test_a_picture_is_in_colour_and_red_free_is_the_one_in_green(open_page: Open, real: Real) -> None:

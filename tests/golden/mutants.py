@@ -164,8 +164,14 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ),
     (
         "services/instrument/capture.py",
-        "QUICK_PX, capture.simulated)",
-        "QUICK_PX, False)",
+        "to_jpeg(shown, THUMBNAIL_PX, capture.simulated)",
+        "to_jpeg(shown, THUMBNAIL_PX, False)",
+        "encoded_files_of_a_capture",
+    ),
+    (
+        "services/instrument/capture.py",
+        "to_jpeg(colour, THUMBNAIL_PX, capture.simulated, window",
+        "to_jpeg(colour, THUMBNAIL_PX, False, window",
         "encoded_files_of_a_capture",
     ),
     (
@@ -183,8 +189,8 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ("services/instrument/capture_pipeline.py", "shot.frame.simulated\n", "False\n", "files_of_a_capture"),
     (
         "services/instrument/exam_events.py",
-        "to_jpeg(look, QUICK_PX, simulated)",
-        "to_jpeg(look, QUICK_PX, False)",
+        "to_jpeg(look, THUMBNAIL_PX, simulated)",
+        "to_jpeg(look, THUMBNAIL_PX, False)",
         "files_of_a_capture",
     ),
     (

@@ -27,7 +27,7 @@ from tests.journey.asking import live_picture
 from tests.journey.conftest import until
 
 RAWS = ("raw.tiff", "raw-1.tiff", "raw-2.tiff", "raw-3.tiff")
-FILES = {*RAWS, "raw-red.tiff", "dark.tiff", "picture.png", "colour.png", "quick.jpg", "report.json"}
+FILES = {*RAWS, "raw-red.tiff", "dark.tiff", "picture.png", "colour.png", "green.jpg", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
 
 

@@ -345,13 +345,13 @@ def test_files_of_a_capture(taken: tuple[Rig, Any, bool]) -> None:
 
 @both
 def test_encoded_files_of_a_capture(simulated: bool) -> None:
-    """Nor has it a quick look: all files are encoded when it is stored."""
+    """All files are encoded when it is stored."""
     at, picture = VirtualClock().wall(), np.random.default_rng(0).uniform(0, 1, (90, 120)).astype(np.float32)
     exposed = Frame(np.full((90, 120), 500, np.uint16), 0.1, 1, Illumination("green"), simulated)
     press = Press(Future(), "OD", CaptureTarget(), None)
     shot = ExposedCapture(press, "a", at, (exposed,), None, 0.2, DoseReport(), Verdict("good", None, {}))
     capture = Capture("a", "OD", at, simulated, "c", CaptureReport(Report("tikhonov"), light=DoseReport()), {})
-    files = capture_files(capture, "head", shot, picture, None, np.stack([picture] * 3, axis=2))
+    files = capture_files(capture, "head", shot, picture, np.stack([picture] * 3, axis=2))
     for name, content in files.items():
         assert isinstance(content, bytes)
         assert stated_in(name, io.BytesIO(content)) is simulated, name

@@ -1,6 +1,6 @@
 """Capture pipeline by itself, in virtual time: exposure, verdict, steps of the reconstruction, record, live picture."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,15 +17,16 @@ from device.light_safety.guard import GuardedLight
 from device.recon.assessment.exposure_split import WHOLE
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.burst_reconstructor import PreparedFrame
+from device.recon.colour_reconstructor import without_psf
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import RoundDone, StageResult, Step
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import Colour, ExposureSettings, Frame, Illumination, Reconstruction, WhiteReference
+from device.values import ChannelUse, Colour, ExposureSettings, Frame, Illumination, Reconstruction, WhiteReference
 from services.instrument.capture import ExposedCapture, Press, split_notes
-from services.instrument.capture_pipeline import NO_PSF, CapturePipeline, expose
+from services.instrument.capture_pipeline import CapturePipeline, expose
 from services.records.capture_target import CaptureTarget
 from tests.journey.conftest import SMALL_HEAD
 from tests.property.exam_sequences import ROUND_S, ROUNDS, TINY, Conditions, PlainFeedback, TinyReconstructor
@@ -129,7 +130,7 @@ def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
     assert (capture.id, capture.eye, capture.simulated) == (shot.id, "OD", True)
     assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
     assert capture.report.reconstruction.seconds["expose"] == pytest.approx(shot.expose_s)
-    assert set(record.files(None)) == {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
+    assert set(record.files()) == {"raw.tiff", "dark.tiff", "picture.png", "green.jpg", "quick.jpg", "report.json"}
 
 
 def test_a_live_picture_is_exposed_in_the_aiming_colour(bench: Bench) -> None:
@@ -147,6 +148,9 @@ class NoColours:
     """Reconstruction of other colours of a head whose calibration has none."""
 
     others: tuple[Colour, ...] = ()
+
+    def deadline_of_green(self, deadline: Deadline, colours: Collection[Colour]) -> Deadline:
+        return deadline
 
     def steps(self, green: Iterator[Step], *_: object, **__: object) -> Iterator[Step]:
         return green
@@ -255,7 +259,7 @@ def test_a_colour_that_fails_leaves_the_lit_frames_and_its_reason(bench: Bench) 
     assert (len(exposure.lit), dict(exposure.colours)) == (3, {})
     spent_j_per_cm2 = bench.head.light.ledger.spent_j_per_cm2("OD") - before_j_per_cm2
     assert exposure.dose_j_per_cm2 == pytest.approx(spent_j_per_cm2), "the red light was given, too"
-    assert exposure.missing == {"red": "no frame came"}
+    assert exposure.missing == (ChannelUse("red", None, reason="no frame came", code="camera.stalled"),)
     assert exposure.dark.illumination is None
     assert bench.world.illumination is None
 
@@ -270,8 +274,8 @@ def test_a_colour_without_a_psf_is_not_lit_and_its_reason_kept(bench: Bench) -> 
         colours=NoColours(),
     )
     exposure = with_colours.expose("OD", colours=["red"])
-    assert (dict(exposure.colours), exposure.missing) == ({}, {"red": NO_PSF})
-    assert bench.pipeline.expose("OD", colours=["red"]).missing == {}, "a pipeline of one colour by design"
+    assert (dict(exposure.colours), exposure.missing) == ({}, (without_psf("red"),))
+    assert bench.pipeline.expose("OD", colours=["red"]).missing == (), "a pipeline of one colour by design"
     assert bench.world.frames == 4
 
 
@@ -289,7 +293,7 @@ class SeesLights(RedOnly):
         *,
         simulated: bool,
         deadline: Deadline | None = None,
-        missing: Mapping[Colour, str] | None = None,
+        missing: Sequence[ChannelUse] = (),
         lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:
         self.lights_dn_per_s = lights_dn_per_s or {}

@@ -1,16 +1,18 @@
 """Colour pictures of an instrument: steps, deadline, refraction, and the reasons of a colour that is missing."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from device.clock import Deadline, SystemClock
-from device.recon.colour_reconstructor import NO_TIME, ColourReconstruction, ColourReconstructor
+from device.clock import Deadline, SystemClock, VirtualClock
+from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
 from device.recon.estimation.psf_warp import Wavefront
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor, RoundDone, StageResult, Step
 from device.recon.white_balance import OVER_GREEN, RGB
-from device.values import Colour, Image, Reconstruction
+from device.values import ChannelUse, Colour, Image, Reconstruction
 from tests.moving_retina import RETINA, SHAPE, burst_calibration, field, frame, seen
 
 PLANNER = Planner(folder=None, effort="FFTW_ESTIMATE")
@@ -29,7 +31,7 @@ class Bench:
         self.frames = {"green": frame(seen(RETINA, (0, 0)), 2000, 1), "red": frame(seen(RED, MOVED_PX), 2000, 2)}
 
     def steps(
-        self, red: np.ndarray | None = None, deadline: Deadline | None = None, missing: dict[Colour, str] | None = None
+        self, red: np.ndarray | None = None, deadline: Deadline | None = None, missing: Sequence[ChannelUse] = ()
     ) -> list[Step]:
         green = self.green.steps(self.frames["green"], simulated=True, deadline=deadline)
         frames: dict[Colour, list[np.ndarray]] = (
@@ -85,20 +87,36 @@ def correlation(one: Image, other: Image, inside: np.ndarray) -> float:
     return float(np.corrcoef(one[inside], other[inside])[0, 1])
 
 
-def test_a_budget_without_time_gives_green_and_the_reason(bench: Bench) -> None:
-    made = bench.picture(deadline=Deadline.after(SystemClock(), 0.001))
-    assert not isinstance(made, ColourReconstruction)
-    assert [(one.name, one.reason) for one in made.report.channels] == [("green", None), ("red", NO_TIME)]
-    assert isinstance(bench.picture(deadline=Deadline.after(SystemClock(), 60)), ColourReconstruction)
+@pytest.mark.parametrize("budget_s", [0.001, 0.1, 60.0])
+def test_no_budget_is_too_short_for_a_colour(bench: Bench, budget_s: float) -> None:
+    """Else some pictures of a visit would be in colour and others not."""
+    made = bench.picture(deadline=Deadline.after(SystemClock(), budget_s))
+    assert isinstance(made, ColourReconstruction)
+    assert [(one.name, one.reason) for one in made.report.channels][:2] == [("green", None), ("red", None)]
+
+
+def test_green_leaves_the_colours_their_time_and_has_half_of_it(bench: Bench) -> None:
+    clock = VirtualClock()
+    first = bench.red.stages[0]
+    least_s = first.start_cost.seconds + first.finish_cost.seconds + bench.colours.join_cost.seconds
+    assert least_s > 0
+    for budget_s in (4 * least_s, least_s):
+        deadline = Deadline.after(clock, budget_s)
+        left_s = bench.colours.deadline_of_green(deadline, ["red"]).left_s()
+        assert left_s == pytest.approx(max(budget_s - least_s, budget_s / 2))
+        assert bench.colours.deadline_of_green(deadline, []) == deadline
 
 
 def test_a_useless_frame_or_none_of_a_colour_gives_green_and_the_reason(bench: Bench) -> None:
-    for given in ({"red": bench.frames["red"][::2]}, {"missing": {"red": "no red light"}}):
+    for given in (
+        {"red": bench.frames["red"][::2]},
+        {"missing": [ChannelUse("red", None, reason="no red light", code="light.limit")]},
+    ):
         made = bench.picture(**given)
         assert not isinstance(made, ColourReconstruction)
         green, red = made.report.channels
         assert (green.shift_px, green.reason) == ((0.0, 0.0), None)
-        assert (red.shift_px, bool(red.reason)) == (None, True)
+        assert (red.shift_px, bool(red.reason), bool(red.code)) == (None, True, True)
 
 
 def test_red_is_solved_with_its_psf_stretched_as_that_of_green(bench: Bench) -> None:

@@ -82,14 +82,31 @@ function tile(state, actions, { id, eye, field }) {
       ?disabled=${Boolean(state.visit?.finished_at) && !capture}
       @click=${() => actions.chooseTile(id)}
     >
-      <span class="thumb">${capture ? thumb(capture, actions) : nothing}<span class="mark">${face === "empty" && has(`field.${field}`) ? target(eye, field) : icon(mark)}</span></span>
+      <span class="thumb">${capture ? thumb(state.visit, capture, actions) : nothing}<span class="mark">${face === "empty" && has(`field.${field}`) ? target(eye, field) : icon(mark)}</span></span>
       <span class="tile-word">${short}</span>
     </button>
   `;
 }
 
-export const thumb = (capture, actions) =>
-  html`<img src=${captureFileUrl(capture, "quick.jpg")} alt="" loading="lazy" @load=${actions.thumbLoaded} @error=${actions.thumbFailed} />`;
+/**
+ * Thumbnail of a stored capture: the picture that its visit shows first, reduced.
+ * @param {import("../core/state.js").Visit | null} visit
+ */
+export const thumb = (visit, capture, actions) =>
+  html`<img src=${captureFileUrl(capture, visit?.no_colour ? "green.jpg" : "quick.jpg")} alt="" loading="lazy" @load=${actions.thumbLoaded} @error=${actions.thumbFailed} />`;
+
+const LIGHT_LIMITS = ["light.limit", "light.day", "light.visit"];
+
+/**
+ * Why the pictures of a visit are shown in green light; "" for a visit in colour.
+ * @param {import("../core/state.js").Visit | null} visit
+ */
+export function whyGreen(visit) {
+  const code = visit?.no_colour;
+  if (!code) return "";
+  if (LIGHT_LIMITS.includes(code)) return t("green.light");
+  return t(code === "colour.none" || code === "colour.psf" ? `green.${code.slice(7)}` : "green.failed");
+}
 
 const EXAM_BUTTONS = new Set(["otherEye", "finish"]); // only shown during an exam
 

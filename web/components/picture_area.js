@@ -1,9 +1,9 @@
 // Picture area: live preview and taken picture in the same place, without layout shift, and the prompt line below.
 
 import { icon } from "./icons.js";
-import { finalPicture, pictureLinks } from "../core/api.js";
+import { colourLink, finalPicture } from "../core/api.js";
 import { allowsLight, consentOf, eyeOf, currentShot } from "../core/state.js";
-import { chips, slotLabel, standing, topAlert, alertBar, versionName } from "./components.js";
+import { chips, slotLabel, standing, topAlert, alertBar, versionName, whyGreen } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
 
@@ -46,7 +46,7 @@ export function pictureArea(state, actions) {
           aria-label=${pictureName(state, shot)}
           .head=${state.status}
           .subject=${shot?.key ?? null}
-          .redfree=${state.redfree && !(shot?.capture && pictureLinks(shot.capture, state.version).colour)}
+          .redfree=${state.redfree && !(shot?.capture && colourLink(shot.capture, state.version, state.visit))}
           .brightness=${state.brightness}
           .contrast=${state.contrast}
           .loupe=${state.loupe}
@@ -62,8 +62,8 @@ export function pictureArea(state, actions) {
   `;
 }
 
-function sourceOf(shot, { redfree, version }) {
-  if (shot?.capture) return finalPicture(shot.capture, redfree, version);
+function sourceOf(shot, { redfree, version, visit }) {
+  if (shot?.capture) return finalPicture(shot.capture, redfree, visit, version);
   return shot?.quick ? { url: shot.quick, mark: "quick" } : null;
 }
 
@@ -114,8 +114,9 @@ function markPrompt(state) {
   const shot = currentShot(state);
   if (shot?.stage.name === "expose" && !shot.verdict && !shot.capture) return ["hold", "hand", t("make.expose")];
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
-  if (state.picture === "final" && shot?.verdict?.word === "again" && !state.version) return ["plain", "pen", t("mark.final.again")];
-  if (state.picture === "final") return ["done", "check", t(state.version ? "version.note" : "mark.final")];
+  if (state.picture === "final" && shot?.verdict?.word === "again" && !state.version) return ["plain", "pen", [t("mark.final.again"), whyGreen(state.visit)].filter(Boolean).join(" · ")];
+  if (state.picture === "final" && state.version) return ["done", "check", t("version.note")];
+  if (state.picture === "final") return ["done", "check", [t("mark.final"), whyGreen(state.visit)].filter(Boolean).join(" · ")];
   if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
   return ["wait", "wait", t("make.refine")];
 }

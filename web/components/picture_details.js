@@ -1,6 +1,6 @@
 // Details dialog of a picture: reconstruction data, files to download, and the change to the other eye.
 
-import { versionName } from "./components.js";
+import { versionName, whyGreen } from "./components.js";
 import { icon } from "./icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { number, t } from "../i18n/translate.js";
@@ -55,7 +55,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
   return html`<dialog id="details" aria-labelledby="details-title">
     <h2 id="details-title">${t("result.details")}</h2>
     ${(report.warnings ?? []).map((one) => html`<p class="warning">${icon("warn")} ${one}</p>`)}
-    ${grey && !links.colour ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
+    ${whyGreen(visit) ? html`<p class="muted">${whyGreen(visit)}</p>` : grey && !links.colour ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
     <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
     <p class="links">
       ${visit?.finished_at

@@ -150,11 +150,22 @@ function parseAim(header) {
 export const pictureLinks = ({ links, versions = [] }, version) => versions.find(({ number }) => number === version) ?? links;
 
 /**
+ * Return the URL of the picture in colour of a capture or one of its versions. Pictures as taken are shown in colour in
+ * all of a visit or in none: undefined where the server names a reason against it.
+ * @param {import("./state.js").Capture} capture
+ * @param {number} version
+ * @param {import("./state.js").Visit | null} visit
+ */
+export const colourLink = (capture, version, visit) =>
+  visit?.no_colour && !version ? undefined : pictureLinks(capture, version).colour;
+
+/**
  * Return the source for <eye-pic> of a capture or one of its versions: the picture in colour, or red-free the one in
  * green light. Without a picture in colour there is only the latter, and the viewer's own red-free tool.
  */
-export function finalPicture(capture, redfree, version = 0) {
-  const { picture, colour } = pictureLinks(capture, version);
+export function finalPicture(capture, redfree, visit, version = 0) {
+  const { picture } = pictureLinks(capture, version);
+  const colour = colourLink(capture, version, visit);
   return colour && !redfree ? { url: colour, mark: "final" } : { url: picture, mark: "final", redfree: Boolean(colour) };
 }
 

@@ -44,8 +44,8 @@ const settings = Object.freeze({
  * @typedef {{word: string, code?: string | null}} Verdict
  * @typedef {{state: string, capture: string | null, captures: string[], verdict: Verdict | null, reason: string | null, tries: number}} Slot
  * @typedef {{id: string, number: string, begun_at: string, fields: Record<string, any>, slots: Record<string, Slot>,
- *   next_slot: string | null, outcome: {code: string, sentence: string} | null, finished_at: string | null,
- *   day: string, undo_until: string | null, waiting?: string[]}} Visit
+ *   next_slot: string | null, no_colour: string | null, outcome: {code: string, sentence: string} | null,
+ *   finished_at: string | null, day: string, undo_until: string | null, waiting?: string[]}} Visit
  * @typedef {{id: string, visit: string | null, slot: string | null, eye: string, taken_at: string, verdict: Verdict | null,
  *   simulated: boolean, report: any, links: Record<string, string>, versions?: any[], calibration_id: string, test: boolean}} Capture
  * @typedef {{key: string, visit: string, slot: string, eye: string, id: string | null,

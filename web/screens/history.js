@@ -1,11 +1,11 @@
 // History screens: patients of a day, pictures of a patient, comparison of two pictures with synchronised zoom. Loaded
 // on demand.
 
-import { finalPicture, montagePictureUrl, visitZipUrl } from "../core/api.js";
+import { colourLink, finalPicture, montagePictureUrl, visitZipUrl } from "../core/api.js";
 import { patientList } from "./home.js";
 import { outcomeTexts, reopenButton } from "./outcome.js";
 import { icon } from "../components/icons.js";
-import { choice, slotLabel, thumb } from "../components/components.js";
+import { choice, slotLabel, thumb, whyGreen } from "../components/components.js";
 import { displayNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, isoDay, t, today } from "../i18n/translate.js";
@@ -64,6 +64,7 @@ export function film(state, actions) {
     <section class="film">
       <h2>${t("film.title", { number: displayNumber(visit.number) })}</h2>
       ${visit.outcome ? html`<p>${outcomeTexts(visit.outcome, state.language).filter(Boolean).join(" · ")}</p>` : nothing}
+      ${whyGreen(visit) ? html`<p class="muted" id="green">${whyGreen(visit)}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => captureItem(state, actions, one))}</ul>` : html`<p>${t("film.none")}</p>`}
       ${Object.entries(state.montages).map(([eye, made]) => montage(visit, actions, eye, made))}
       <div class="ends">
@@ -106,7 +107,7 @@ function captureItem(state, actions, { slot, id }) {
   const on = state.picked.includes(id);
   return html`<li>
     <button type="button" class="open" data-id=${id} @click=${() => actions.openPicture(slot, id)}>
-      <span class="thumb">${thumb(id, actions)}</span> <span>${captureLabel(state, id)}</span>
+      <span class="thumb">${thumb(state.visit, id, actions)}</span> <span>${captureLabel(state, id)}</span>
       ${usedMark(state, id)}
     </button>
     <button type="button" class="pick" aria-pressed=${on} @click=${() => actions.pick(id)}>
@@ -203,9 +204,9 @@ function comparedPicture(state, actions, i) {
       aria-label=${captureLabel(state, id)}
       .head=${status}
       .subject=${id}
-      .redfree=${redfree && !taken?.links.colour}
+      .redfree=${redfree && !(taken && colourLink(taken, 0, state.visit))}
       .loupe=${loupe}
-      .src=${taken ? finalPicture(taken, redfree) : null}
+      .src=${taken ? finalPicture(taken, redfree, state.visit) : null}
       @looked=${actions.linkZoom}
       @loupe=${actions.loupeChanged}
     ></eye-pic>

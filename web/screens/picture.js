@@ -2,7 +2,7 @@
 // button. Three verdict texts: Good, Take again, Could not.
 
 import { icon } from "../components/icons.js";
-import { pictureLinks } from "../core/api.js";
+import { colourLink } from "../core/api.js";
 import { currentShot } from "../core/state.js";
 import { choice, question, slotLabel, tiles, versionName } from "../components/components.js";
 import { ALERTS, timeLeft, alertText } from "../core/alerts.js";
@@ -104,7 +104,7 @@ const progressBar = ({ stage }) => html`<progress max="1" .value=${stage.fractio
 // ---- tools
 
 /** @param {State} state */
-function tools({ redfree, version, brightness, contrast, loupe, zoom }, actions, capture) {
+function tools({ redfree, version, visit, brightness, contrast, loupe, zoom }, actions, capture) {
   const step = (tool, label, by) => html`
     <div class="step" data-repeat role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
@@ -119,7 +119,7 @@ function tools({ redfree, version, brightness, contrast, loupe, zoom }, actions,
       <div class="pair">
         ${[false, true].map(
           (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => actions.setRedfree(on)}>
-            ${t(on ? "tool.redfree" : capture && pictureLinks(capture, version).colour ? "tool.colour" : "tool.plain")}
+            ${t(on ? "tool.redfree" : capture && colourLink(capture, version, visit) ? "tool.colour" : "tool.plain")}
           </button>`,
         )}
       </div>

@@ -74,8 +74,9 @@ def captures_router(store: CaptureStore, arbiter: HeadArbiter) -> APIRouter:
     def file(id: str, name: str = InPath(pattern="^[a-z]+(-([0-9]+|[a-z]+))?[.](png|jpg|tiff|json)$")) -> Response:
         """Return one file of a capture.
 
-        `picture-1.png`, `colour-1.png` and `report-1.json` are those of its first later version. `quick.jpg` of a
-        capture in progress is its quick look. 404 for an unknown capture or file, 500 for a damaged one.
+        `picture-1.png`, `colour-1.png` and `report-1.json` are those of its first later version. `quick.jpg` is the
+        picture that is shown first, reduced, and of a capture in progress its quick look; `green.jpg` is `picture.png`
+        reduced. 404 for an unknown capture or file, 500 for a damaged one.
         """
         exam = arbiter.current_exam
         quick = exam.quick(id) if name == "quick.jpg" and exam is not None else None

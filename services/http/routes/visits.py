@@ -200,6 +200,7 @@ def visit_answer(visit: Visit, repository: VisitRepository) -> VisitAnswer:
             fields=dict(visit.fields),
             slots={id: _slot_answer(slot) for id, slot in visit.slots.items()},
             next_slot=visit.next_slot,
+            no_colour=visit.no_colour,
             outcome=OutcomeAnswer(code=ending.code, sentence=ending.sentence) if ending else None,
             finished_at=visit.finished_at,
             undo_until=repository.undo_until(visit),

@@ -102,8 +102,9 @@ class FrameAnswer(StoredPart):
 class ChannelAnswer(StoredPart):
     """One colour of light: its shift from green (rows, cols; pixels), whether it is predicted, not measured.
 
-    `reason`: why the picture has not this colour; null for one that it has. `white_ratio`: its light over that of a
-    white card; only with a white reference, else the hue is neutral. File `raw-red.tiff` is the raw frame of red.
+    `reason`: why the picture has not this colour, and `code` its name for programs; null for one that it has.
+    `white_ratio`: its light over that of a white card; only with a white reference, else the hue is neutral. File
+    `raw-red.tiff` is the raw frame of red.
     """
 
     name: Colour
@@ -111,6 +112,7 @@ class ChannelAnswer(StoredPart):
     predicted: bool
     reason: str | None
     white_ratio: OmittedIfNone[Number] = None
+    code: OmittedIfNone[str] = None
 
 
 class EyeCorrectionAnswer(StoredPart):

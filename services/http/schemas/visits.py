@@ -84,7 +84,8 @@ class VisitAnswer(ResponseBody):
     """A visit with its form fields and picture slots; `day` is the local date.
 
     `next_slot`: first empty slot, or null. `outcome`, `finished_at`: null until the visit is finished. `undo_until`:
-    time until which the finish can be undone, or null.
+    time until which the finish can be undone, or null. `no_colour`: code of the reason why the pictures are shown in
+    green light; null if all are in colour.
     """
 
     id: str
@@ -94,6 +95,7 @@ class VisitAnswer(ResponseBody):
     fields: dict[str, FieldAnswer]
     slots: dict[str, SlotAnswer]
     next_slot: str | None
+    no_colour: str | None
     outcome: OutcomeAnswer | None
     finished_at: Timestamp | None
     undo_until: Timestamp | None

@@ -1,0 +1,118 @@
+"""A visit is shown in colour with all of its pictures, or with none: over HTTP, with the reason, and its thumbnails."""
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from device.ports import Camera
+from services.records.protocol import load_protocol
+from tests.journey.asking import visit_with_consent
+from tests.journey.conftest import GateClock, MakeRig, Rig
+from tests.red_light import FailsInRed
+
+SLOTS = ("R-centre", "R-nerve", "L-centre")
+JPEG_DN = 4  # mean difference of a JPEG of quality 70 from its picture, 8-bit levels
+
+
+class TickingClock(GateClock):
+    """Virtual clock that is a computer too slow for any time budget: each look at it in the dark takes `tick_s`."""
+
+    tick_s = 0.0
+
+    def now_s(self) -> float:
+        if self.world is not None and self.world.illumination is None:
+            self.elapsed_s += self.tick_s
+        return super().now_s()
+
+
+def begin(rig: Rig) -> str:
+    return str(visit_with_consent(rig)["id"])
+
+
+def press(rig: Rig, visit: str, slot: str) -> Any:
+    eye = "OD" if slot[0] == "R" else "OS"
+    answer = rig.request("POST", "/api/captures", json={"eye": eye, "visit": visit, "slot": slot})
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def why_green(rig: Rig, visit: str) -> str | None:
+    """Return the reason in the visit, which the list of visits gives too."""
+    found = rig.request("GET", f"/api/visits/{visit}").json()["no_colour"]
+    assert rig.request("GET", "/api/visits").json()["visits"][0]["no_colour"] == found
+    return None if found is None else str(found)
+
+
+@pytest.fixture
+def camera_and_rig(make_rig: MakeRig) -> tuple[FailsInRed, Rig]:
+    cameras: list[FailsInRed] = []
+
+    def wrapped(camera: Camera) -> Camera:
+        cameras.append(FailsInRed(camera))
+        return cameras[0]
+
+    rig = make_rig(camera=wrapped)
+    return cameras[0], rig
+
+
+def test_a_budget_that_is_over_before_the_colours_leaves_none_out(make_rig: MakeRig) -> None:
+    clock = TickingClock()
+    rig = make_rig(clock=clock)
+    clock.tick_s = 0.5
+    visit = begin(rig)
+    made = [press(rig, visit, slot) for slot in SLOTS]
+    clock.tick_s = 0.0
+    assert {one["report"]["stopped"] for one in made} == {"deadline"}
+    assert all("colour" in one["links"] for one in made)
+    assert why_green(rig, visit) is None
+
+
+def test_one_picture_without_colour_shows_its_visit_in_green_and_takes_no_more_red(
+    camera_and_rig: tuple[FailsInRed, Rig],
+) -> None:
+    camera, rig = camera_and_rig
+    visit = begin(rig)
+    assert why_green(rig, visit) is None
+    assert "colour" in press(rig, visit, "R-centre")["links"]
+    assert why_green(rig, visit) is None
+    camera.fails = True
+    red = next(one for one in press(rig, visit, "R-nerve")["report"]["channels"] if one["name"] == "red")
+    assert (red["reason"], red["code"]) == ("no frame came", "camera.stalled")
+    assert why_green(rig, visit) == "camera.stalled"
+    camera.fails = False
+    assert "channels" not in press(rig, visit, "L-centre")["report"]
+    assert camera.reds == 2, "light that is not shown is not given"
+    assert why_green(rig, visit) == "camera.stalled"
+    assert "colour" in press(rig, begin(rig), "R-centre")["links"], "the next visit begins anew"
+
+
+def test_a_programme_of_one_colour_has_its_reason(make_rig: MakeRig) -> None:
+    rig = make_rig(protocol=load_protocol().model_copy(update={"colours": ()}))
+    visit = begin(rig)
+    press(rig, visit, "R-centre")
+    assert why_green(rig, visit) == "colour.none"
+
+
+def test_a_calibration_without_a_psf_in_red_has_its_reason(make_rig: MakeRig) -> None:
+    rig = make_rig(tinted=("green",))
+    visit = begin(rig)
+    press(rig, visit, "R-centre")
+    assert why_green(rig, visit) == "colour.psf"
+
+
+def pixels(content: bytes) -> Any:
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), np.float64)
+
+
+@pytest.mark.parametrize(("thumbnail", "picture"), [("quick.jpg", "colour.png"), ("green.jpg", "picture.png")])
+def test_a_thumbnail_is_the_picture(old_rig: Rig, thumbnail: str, picture: str) -> None:
+    id = press(old_rig, begin(old_rig), "R-centre")["id"]
+    small, whole = (
+        pixels(old_rig.request("GET", f"/api/captures/{id}/{name}").content) for name in (thumbnail, picture)
+    )
+    assert small.shape == whole.shape, "a small head: nothing is reduced"
+    middle = np.s_[20:-20, 20:-20]  # between the marks in the pixels
+    assert np.abs(small[middle] - whole[middle]).mean() < JPEG_DN
