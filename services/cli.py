@@ -94,7 +94,7 @@ def run(
     updates: Annotated[
         Path | None, typer.Option(help="The updater's folder, for the page to show.", readable=False)
     ] = None,
-    wishes: Annotated[
+    update_requests: Annotated[
         Path | None, typer.Option(help="Where the updater takes what the page asks for.", readable=False)
     ] = None,
     send: Annotated[Path | None, typer.Option(help="Where finished visits are sent, as TOML; else nowhere.")] = None,
@@ -120,7 +120,7 @@ def run(
         plan,
         measure_scene,
         tuple(name or ()),
-        (updates, wishes),
+        (updates, update_requests),
         uploader,
     )
 

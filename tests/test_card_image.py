@@ -37,7 +37,7 @@ PROGRAMS = {
     "NetworkManager": ("network-manager", "services/identity/apply_settings.py"),
     "rpi-fw-crypto": ("rpifwcrypto", f"{CARD}/luks/diffuscope-key.service"),
     "iw": ("iw", "systemd/diffuscope-country.service"),
-    "unsquashfs": ("squashfs-tools", "systemd/diffuscope-wish.service"),
+    "unsquashfs": ("squashfs-tools", "systemd/diffuscope-update-request.service"),
 }
 RULES = r"bool|dir|file|string(-or-empty)?|size|int(:\d+-\d+)?|regex:.+|keywords:[\w,-]+|list:[\w,-]+|[\w-]+(,[\w-]+)+"
 
@@ -232,7 +232,7 @@ def test_every_file_beside_the_recipe_is_installed() -> None:
         "diffuscope-identity.service",
         "diffuscope-settle.service",
         "diffuscope-update.timer",
-        "diffuscope-wish.path",
+        "diffuscope-update-request.path",
         "diffuscope-clock.path",
     }
     assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

@@ -507,14 +507,16 @@ def test_systemd_analyze_accepts_every_unit(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("name", ["diffuscope-settle", "diffuscope-update", "diffuscope-wish"])
+@pytest.mark.parametrize("name", ["diffuscope-settle", "diffuscope-update", "diffuscope-update-request"])
 def test_an_update_unit_has_a_valid_command_and_sandboxing(name: str) -> None:
     """It runs as root without capabilities, on a file system that is read-only except for its state folder."""
     service = unit_of(f"systemd/{name}.service")["Service"]
     called = service["ExecStart"].removeprefix("/opt/diffuscope/.venv/bin/python -m services.update ")
     assert not unknown_words(f"diffuscope update {called}")
     assert called.split()[0] in typer.main.get_group(update_app).commands
-    exempt = {"ProtectKernelModules"} if name == "diffuscope-wish" else set()  # whether a version must bring its kernel
+    exempt = (
+        {"ProtectKernelModules"} if name == "diffuscope-update-request" else set()
+    )  # whether a version must bring its kernel
     assert {key for key in HARDENING if service.get(key) != "yes"} == exempt
     assert (service["ProtectSystem"], service["CapabilityBoundingSet"]) == ("strict", "")
     assert service["StateDirectory"] == UpdateSettings().folder.name
@@ -523,18 +525,18 @@ def test_an_update_unit_has_a_valid_command_and_sandboxing(name: str) -> None:
 
 def test_page_updater_and_systemd_use_the_same_folders() -> None:
     """The page writes update requests into the folder that the updater's path unit watches."""
-    state, wishes = str(UpdateSettings().folder), str(UpdateSettings().wishes)
+    state, requests = str(UpdateSettings().folder), str(UpdateSettings().requests)
     instrument = unit_of("systemd/diffuscope.service")["Service"]
-    assert f"--updates {state} --wishes {wishes}" in instrument["ExecStart"]
+    assert f"--updates {state} --update-requests {requests}" in instrument["ExecStart"]
     clock = "/run/diffuscope-clock"  # where the page leaves the time of a tablet
-    assert instrument["ReadWritePaths"] == f"-{clock} -{wishes} -{state}/{TABLET} -/media"
-    assert unit_of("systemd/diffuscope-wish.path")["Path"]["PathExists"] == f"{wishes}/{REQUEST_FILE}"
-    assert unit_of("systemd/diffuscope-wish.service")["Service"]["ReadWritePaths"] == wishes
+    assert instrument["ReadWritePaths"] == f"-{clock} -{requests} -{state}/{TABLET} -/media"
+    assert unit_of("systemd/diffuscope-update-request.path")["Path"]["PathExists"] == f"{requests}/{REQUEST_FILE}"
+    assert unit_of("systemd/diffuscope-update-request.service")["Service"]["ReadWritePaths"] == requests
     made = [line.split() for line in text("systemd/diffuscope.tmpfiles").splitlines() if line.startswith("d ")]
     shared = ["2770", "root", "diffuscope-update", "-"]
     own = ["0711", "root", "root", "-"]
     offered = ["d", clock, "2770", "root", "diffuscope-clock", "-"]
-    assert made == [["d", wishes, *shared], offered, ["d", state, *own], ["d", f"{state}/{TABLET}", *shared]]
+    assert made == [["d", requests, *shared], offered, ["d", state, *own], ["d", f"{state}/{TABLET}", *shared]]
     assert unit_of("systemd/diffuscope-clock.path")["Path"]["PathExists"] == f"/{clock_request.REQUEST}"
     assert f"/{clock_request.REQUEST}".startswith(f"{clock}/")
     for group in ("diffuscope-clock", "diffuscope-update"):

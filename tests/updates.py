@@ -40,7 +40,7 @@ class Board:
     @classmethod
     def new(cls, folder: Path, instrument: str = NOWHERE) -> "Board":
         """Return a factory-new device: slot A runs and is committed."""
-        for name in ("chooser", "media/STICK", f"state/{TABLET}", "wishes"):
+        for name in ("chooser", "media/STICK", f"state/{TABLET}", "requests"):
             (folder / name).mkdir(parents=True)
         (folder / "chooser/autoboot.txt").write_text(AUTOBOOT)
         (folder / "cmdline").write_text("rauc.slot=A\n")
@@ -52,7 +52,7 @@ class Board:
 
     @property
     def requests(self) -> Path:
-        return self.folder / "wishes"
+        return self.folder / "requests"
 
     @property
     def stick(self) -> Path:
@@ -68,7 +68,7 @@ class Board:
         known: dict[str, object] = {
             "sticks": here / "media",
             "folder": self.state,
-            "wishes": self.requests,
+            "requests": self.requests,
             "keyring": here / "ca.crt",
             "rauc": (sys.executable, "-IS", str(RAUC), str(here)),
             "instrument": self.instrument,
@@ -135,7 +135,7 @@ class Board:
 
     @contextmanager
     def path_unit(self, version: str) -> Iterator[list[str]]:
-        """Emulate `diffuscope-wish.path` while version `version` runs; yield the list of the updater's outputs."""
+        """Emulate `diffuscope-update-request.path` while version `version` runs; yield the outputs of the updater."""
         outputs: list[str] = []
         over = Event()
 

@@ -1,7 +1,7 @@
 """Inter-process communication of page and updater by two files: a journal from the updater, a request from the page.
 
     STATE/journal.json   written by the updater (root), readable by every user: progress and found updates
-    RUN/wish.json        written for the page by the unprivileged server; the updater removes it before it parses it
+    RUN/request.json     written for the page by the unprivileged server; the updater removes it before it parses it
 
 Both files are untrusted input: they are read completely, up to a size limit, and validated. A request holds no path,
 only the id of an update that the updater itself found.
@@ -21,7 +21,7 @@ from device import atomic_io
 from device.errors import DiffuscopeError
 from services.errors import UpdateRequestInvalid
 
-STATE_FILE, REQUEST_FILE = "journal.json", "wish.json"
+STATE_FILE, REQUEST_FILE = "journal.json", "request.json"
 TABLET = "tablet"  # subfolder of the updater's folder for files uploaded by the page
 UPLOAD = "update.raucb"  # its only file
 MAX_STATE_BYTES, MAX_REQUEST_BYTES = 65_536, 1_000
@@ -147,14 +147,14 @@ def take_request(folder: Path) -> UpdateRequest | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise UpdateRequestInvalid(f"the page's wish cannot be read: {error.strerror}") from error
+        raise UpdateRequestInvalid(f"the request of the page cannot be read: {error.strerror}") from error
     finally:
         with suppress(OSError):  # removed already, or not removable: then systemd's start limit ends the retries
             path.unlink()
     try:
         return UpdateRequest.model_validate_json(content)
     except ValidationError as error:
-        raise UpdateRequestInvalid(f"the page's wish is none: {error.errors()[0]['msg']}") from error
+        raise UpdateRequestInvalid(f"the request of the page is invalid: {error.errors()[0]['msg']}") from error
 
 
 def stage_of(entry: UpdateState, runs: str, boot: str) -> str:

@@ -17,7 +17,7 @@ class UpdateSettings(Table):
     authority: Path | None = None  # CA file for the web server; None: system CAs
     sticks: Path = Path("/media")  # mount points of USB drives, one folder each
     folder: Path = Path("/var/lib/diffuscope-update")
-    wishes: Path = Path("/run/diffuscope-update")  # where the page writes requests
+    requests: Path = Path("/run/diffuscope-update")  # where the page writes requests
     keyring: Path = Path("/etc/rauc/keyring.pem")
     rauc: tuple[str, ...] = ("rauc",)
     restart: tuple[str, ...] = ("systemctl", "reboot")

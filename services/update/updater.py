@@ -82,7 +82,7 @@ class Updater:
         """Carry out the page's request, if there is one; an error is stored in the state and reported."""
         self.tidy()
         try:
-            request = ipc.take_request(self._settings.wishes)
+            request = ipc.take_request(self._settings.requests)
             match request and request.do:
                 case "check":
                     self.search()

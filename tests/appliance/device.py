@@ -24,7 +24,7 @@ FOLDERS = ("captures", "compiled", "update", "journal", "network", "timesync", "
 # The container shows the host's kernel command line; ours is mounted over it, also in units with their own /proc.
 FIRST = """\
 mount --bind /run/cmdline /proc/cmdline
-for unit in settle wish; do
+for unit in settle update-request; do
 	place=/run/systemd/system/diffuscope-$unit.service.d
 	mkdir -p $place
 	printf '[Service]\\nBindReadOnlyPaths=/run/cmdline:/proc/cmdline\\n' >$place/slot.conf

@@ -111,7 +111,7 @@ def check_disk(left: Path, marks: str, images: dict[str, bytes]) -> str:
     assert whole or slot == "A"
     (left / "cmdline").write_text(f"rauc.slot={slot}\n")
     chooser = BootChooser(left / "chooser/autoboot.txt", left / "state", left / "word", left / "cmdline")
-    known = {"sticks": left / "media", "folder": left / "state", "wishes": left, "keyring": left}
+    known = {"sticks": left / "media", "folder": left / "state", "requests": left, "keyring": left}
     settings = UpdateSettings(**known, rauc=("true",), restart=("true",), instrument=NOWHERE)  # type: ignore[arg-type]
     runs = "1.0" if slot == "A" else "2.0"
     updater = Updater(settings, SystemClock(), [].append, chooser, runs)

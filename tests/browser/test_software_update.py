@@ -57,7 +57,7 @@ def device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
     (folder / "head.toml").write_text(HEAD.split("[calibration]")[0] + "[sim]\n")
     server = Server(folder / "data", str(folder / "head.toml"))
     board = Board.new(folder / "board", server.url)
-    server.more = ["--updates", str(board.state), "--wishes", str(board.requests)]
+    server.more = ["--updates", str(board.state), "--update-requests", str(board.requests)]
     copy_small_plans(server.data)
     device = Device(server, board, folder)
     device.boot_version("1.0")

@@ -111,7 +111,7 @@ def test_invalid_request_is_refused_and_removed(tmp_path: Path, content: str) ->
 
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_are_refused_and_removed(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
-    folder = tmp_path_factory.mktemp("wishes")
+    folder = tmp_path_factory.mktemp("requests")
     (folder / REQUEST_FILE).write_bytes(content)
     with pytest.raises(UpdateRequestInvalid):
         take_request(folder)
@@ -121,7 +121,7 @@ def test_arbitrary_bytes_are_refused_and_removed(tmp_path_factory: pytest.TempPa
 @pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
 def test_irregular_file_is_not_followed(tmp_path: Path, kind: str) -> None:
     """The folder belongs to an unprivileged process, and root reads it."""
-    secret, path = tmp_path / "secret", tmp_path / "wishes" / REQUEST_FILE
+    secret, path = tmp_path / "secret", tmp_path / "requests" / REQUEST_FILE
     secret.write_text(UpdateRequest(do="check").model_dump_json())
     path.parent.mkdir()
     {"link": lambda: path.symlink_to(secret), "pipe": lambda: os.mkfifo(path), "folder": path.mkdir}[kind]()
