@@ -1,7 +1,7 @@
 """Event log of the instrument: its log messages as JSON lines, rotated and kept across restarts for a technician.
 
-    FOLDER/diary.jsonl                       newest file: one JSON object per line, newest last
-    FOLDER/diary.jsonl.1 ... diary.jsonl.3   older files; rotation deletes the oldest
+    FOLDER/event-log.jsonl                           newest file: one JSON object per line, newest last
+    FOLDER/event-log.jsonl.1 ... event-log.jsonl.3   older files; rotation deletes the oldest
 
 The log contains no patient's name: messages identify captures and visits by id only.
 """
@@ -20,7 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from device import atomic_io
 
-FILE_NAME = "diary.jsonl"
+FILE_NAME = "event-log.jsonl"
 FILE_BYTES, FILES = 500_000, 4  # some months of a clinic
 LOGGER_NAMES = ("device", "services")  # messages of libraries go to the system journal
 MAX_CHARS = 2000

@@ -129,7 +129,7 @@ def serve(
         protocol = _with_own_numbers(protocol, store)
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_path(spec, data))
-        event_log = undo.enter_context(closing(EventLog(data / "diary")))
+        event_log = undo.enter_context(closing(EventLog(data / "event-log")))
         context = AppContext(spec, archive, store, EventBus(), clock, watchdog, stop.failed)
         explorer = AccuracyExplorer(data / "explorer", data / "plans", clock, spec, context.event_bus.publish, measure)
 

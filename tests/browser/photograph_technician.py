@@ -41,7 +41,7 @@ def sections(camera: Camera, server: Server) -> None:
     for room, ready in (
         ("health", "li[data-check]"),
         ("explorer", "accuracy-time svg"),
-        ("diary", ".diary li"),
+        ("event-log", ".event-log li"),
         ("update", ".update"),
     ):
         open_section(page, room)
@@ -57,10 +57,10 @@ def sections(camera: Camera, server: Server) -> None:
     camera.tap("#report-code")
     page.screenshot(path=camera.folder / "health-ill-whole.png", full_page=True)
     page.unroute("**/api/health")
-    open_section(page, "diary")
+    open_section(page, "event-log")
     camera.tap("#to-usb")
-    page.locator(".diary summary").first.tap()
-    camera.take("diary-open", "[role=note]:not(:empty)")
+    page.locator(".event-log summary").first.tap()
+    camera.take("event-log-open", "[role=note]:not(:empty)")
 
 
 def calibration(camera: Camera) -> None:

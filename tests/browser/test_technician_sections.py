@@ -154,36 +154,36 @@ def test_capture_is_recomputed_and_time_limit_is_stored(technician_page: Page) -
 
 
 def test_event_log_lists_events(technician_page: Page) -> None:
-    open_section(technician_page, "diary")
-    expect(technician_page.locator(".diary li").first).to_be_visible()
-    text = technician_page.locator(".diary").inner_text()
+    open_section(technician_page, "event-log")
+    expect(technician_page.locator(".event-log li").first).to_be_visible()
+    text = technician_page.locator(".event-log").inner_text()
     assert "a picture was kept after" in text
     assert "started, version" in text
-    assert layout_faults(technician_page, ".diary li") == []
+    assert layout_faults(technician_page, ".event-log li") == []
 
 
 def test_event_log_is_filtered_and_exported(technician_page: Page) -> None:
     stick = {"id": "0123456789abcdef", "name": "BLUE", "free_bytes": 10**9, "is_writable": True}
     locked = {**stick, "id": "fedcba9876543210", "name": "LOCKED", "is_writable": False}
     technician_page.route("**/api/exports", lambda route: route.fulfill(json={"folders": [locked, stick]}))
-    technician_page.route("**/diary/export", lambda route: route.fulfill(json={"folder": "diary-2026-11-22"}))
-    open_section(technician_page, "diary")
+    technician_page.route("**/event-log/export", lambda route: route.fulfill(json={"folder": "event-log-2026-11-22"}))
+    open_section(technician_page, "event-log")
     with technician_page.expect_download() as saved:
         technician_page.get_by_role("link", name="Save as a file").tap()
     assert "a picture was kept after" in Path(saved.value.path()).read_text()
     technician_page.get_by_role("button", name="Copy to USB").tap()
     expect(technician_page.get_by_role("button", name="LOCKED (read-only)")).to_be_disabled()
-    with technician_page.expect_request("**/diary/export") as asked:
+    with technician_page.expect_request("**/event-log/export") as asked:
         technician_page.get_by_role("button", name="BLUE").tap()
     assert asked.value.post_data_json == {"folder": stick["id"]}
-    expect(technician_page.get_by_role("note")).to_have_text("Copied to BLUE/diary-2026-11-22.")
-    entry = technician_page.locator(".diary li", has_text="a picture was kept after")
+    expect(technician_page.get_by_role("note")).to_have_text("Copied to BLUE/event-log-2026-11-22.")
+    entry = technician_page.locator(".event-log li", has_text="a picture was kept after")
     entry.get_by_text("More").tap()
     entry.get_by_role("button", name="Only this picture").tap()
     expect(technician_page.get_by_text("Only what is about")).to_be_visible()
-    expect(technician_page.locator(".diary li", has_text="started, version")).to_have_count(0)
+    expect(technician_page.locator(".event-log li", has_text="started, version")).to_have_count(0)
     technician_page.get_by_role("button", name="Everything").tap()
-    expect(technician_page.locator(".diary li", has_text="started, version").first).to_be_visible()
+    expect(technician_page.locator(".event-log li", has_text="started, version").first).to_be_visible()
 
 
 def test_health_report_is_copied_saved_and_shown_as_qr_code(technician_page: Page) -> None:

@@ -177,7 +177,7 @@ def exports() -> list[dict[str, Any]]:
         log.ask(copy, at, json=log.key(folder=device.stick_id), note="a second copy")
         log.ask(copy, at, json=log.key(folder="/etc"))
         log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=device.stick_id))
-        _diary(log)
+        _event_log(log)
         _backups(log)
         _montages(log)
         return log.exchanges
@@ -217,16 +217,16 @@ def _backups(log: Transcript) -> None:
         log.ask(operation, note="no technician is logged in")
 
 
-def _diary(log: Transcript) -> None:
-    paths = ("/api/technician/diary", "/api/technician/diary.txt")
+def _event_log(log: Transcript) -> None:
+    paths = ("/api/technician/event-log", "/api/technician/event-log.txt")
     for path in paths:
         log.ask(f"GET {path}", note="no technician is logged in")
-    export = "POST /api/technician/diary/export"
+    export = "POST /api/technician/event-log/export"
     log.ask(export, json={"folder": log.instrument.stick_id}, note="no technician is logged in")
     log.ask("POST /api/technician/pin", json=PIN)
     for path in paths:
         log.ask(f"GET {path}")
-    log.ask("GET /api/technician/diary", "/api/technician/diary?limit=0")
+    log.ask("GET /api/technician/event-log", "/api/technician/event-log?limit=0")
     log.ask(export, json={"folder": log.instrument.stick_id})
     log.ask(export, json={"folder": "/etc"})
 

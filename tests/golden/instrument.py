@@ -238,15 +238,15 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
         undo.callback(owner.close)
         sticks, board = _sticks(folder), Board.new(folder / "board")
         door = PinAuthenticator(folder / "technician.json", clock)
-        diary = EventLog(folder / "diary")
-        undo.callback(diary.close)
+        event_log = EventLog(folder / "event-log")
+        undo.callback(event_log.close)
         desk = UpdateRequests(board.state, board.requests, clock, "1.0")
         backups = BackupRunner(folder / "data", lambda: owner.is_idle, clock)
         undo.callback(backups.close)
         rooms = [
             accuracy_routes(explorer, store, lambda: owner.exam.head.calibration),
             update_routes(desk, door),
-            event_log_routes(diary, sticks, clock),
+            event_log_routes(event_log, sticks, clock),
             backup_routes(backups, store, sticks, clock),
         ]
         application = create_app(

@@ -22,7 +22,7 @@ log = logging.getLogger("services.instrument.test")
 def rig(build: Callable[..., Rig], tmp_path: Path, drives: UsbDrives) -> Iterator[Rig]:
     with ExitStack() as undo:
         rig = build(tmp_path, undo, wait=False)
-        event_log = EventLog(tmp_path / "diary")
+        event_log = EventLog(tmp_path / "event-log")
         undo.callback(event_log.close)
         routers = (event_log_routes(event_log, drives, rig.clock),)
         rig.application = create_app(rig.arbiter, rig.authenticator, technician_routers=routers)
@@ -31,14 +31,14 @@ def rig(build: Callable[..., Rig], tmp_path: Path, drives: UsbDrives) -> Iterato
 
 @pytest.fixture
 def ask(rig: Rig) -> Callable[..., Any]:
-    return technician_requests(rig, "/api/technician/diary")
+    return technician_requests(rig, "/api/technician/event-log")
 
 
 def test_event_log_is_downloaded_as_text(ask: Callable[..., Any]) -> None:
     log.warning("press failed: %s", "the camera is gone", extra={"code": "camera.missing"})
     answer = ask("GET", ".txt")
     assert answer.headers["content-type"] == "text/plain; charset=utf-8"
-    assert 'filename="diary-' in answer.headers["content-disposition"]
+    assert 'filename="event-log-' in answer.headers["content-disposition"]
     assert "WARNING: press failed: the camera is gone (camera.missing)" in answer.text
 
 
@@ -46,14 +46,14 @@ def test_second_copy_to_a_usb_drive_keeps_the_first(ask: Callable[..., Any], sti
     log.info("a picture was kept")
     first, second = (ask("POST", "/export", json={"folder": drive_id(stick)}).json()["folder"] for _ in range(2))
     assert second == f"{first}-2"
-    assert "a picture was kept" in (stick / first / "diary.txt").read_text()
-    lines = (stick / second / "diary.jsonl").read_text().splitlines()
+    assert "a picture was kept" in (stick / first / "event-log.txt").read_text()
+    lines = (stick / second / "event-log.jsonl").read_text().splitlines()
     assert "a picture was kept" in [json.loads(line)["text"] for line in lines]
 
 
 def test_export_needs_a_present_usb_drive_and_the_login(ask: Callable[..., Any], rig: Rig, tmp_path: Path) -> None:
     refused = ask("POST", "/export", json={"folder": str(tmp_path)})
     assert (refused.status_code, refused.json()["code"]) == (503, "stick.gone")
-    for method, path in (("GET", "/diary"), ("GET", "/diary.txt"), ("POST", "/diary/export")):
+    for method, path in (("GET", "/event-log"), ("GET", "/event-log.txt"), ("POST", "/event-log/export")):
         away = {"json": {"folder": str(tmp_path)}} if method == "POST" else {}
         assert rig.request(method, f"/api/technician{path}", **away).json()["code"] == "technician.locked"

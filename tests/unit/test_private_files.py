@@ -60,7 +60,7 @@ def test_a_data_folder_is_private_with_any_umask(umask: int, tmp_path: Path) -> 
         CaptureJournal(store).begin(InterruptedCapture("d", "OD"))
         Snapshots(data / "store.sqlite", clock).create("s0001")
         PinAuthenticator(data / "technician.json", clock).set_pin("1234", None)
-        log = EventLog(data / "diary")
+        log = EventLog(data / "event-log")
         getLogger("services").info("an entry")
         log.close()
         (tmp_path / "stick").mkdir()

@@ -1,4 +1,4 @@
-// <instrument-diary>: event log of the instrument, of everything or of one picture; code and details are collapsed.
+// <instrument-event-log>: event log of the instrument, of everything or of one picture; code and details are collapsed.
 // Export as a file or to a USB drive.
 
 import { sentences } from "../core/api.js";
@@ -25,7 +25,7 @@ class EventLog extends HTMLElement {
     const response = await fetch(path, { cache: "no-store", ...options }).catch(() => null);
     const body = await response?.json().catch(() => null);
     if (response?.ok && body) return body;
-    this.#set({ error: body?.message ? sentences(body) : t("diary.failed"), message: "" });
+    this.#set({ error: body?.message ? sentences(body) : t("event-log.failed"), message: "" });
     return null;
   }
 
@@ -33,7 +33,7 @@ class EventLog extends HTMLElement {
     const { about } = this.#state;
     /** @type {Record<string, string>} */
     const query = about ? { limit: "300", about } : { limit: "300" };
-    const answer = await this.#request(`/api/technician/diary?${new URLSearchParams(query)}`);
+    const answer = await this.#request(`/api/technician/event-log?${new URLSearchParams(query)}`);
     if (answer) this.#set({ entries: answer.entries, error: "" });
   }
 
@@ -50,22 +50,22 @@ class EventLog extends HTMLElement {
       if (answer) this.#set({ folders: answer.folders, message: answer.folders.length ? "" : t("film.nofolder"), error: "" });
     },
     copy: async ({ id, name }) => {
-      const done = await this.#request("/api/technician/diary/export", { ...EXPORT, body: JSON.stringify({ folder: id }) });
-      if (done) this.#set({ folders: null, message: t("diary.copied", { folder: `${name}/${done.folder}` }), error: "" });
+      const done = await this.#request("/api/technician/event-log/export", { ...EXPORT, body: JSON.stringify({ folder: id }) });
+      if (done) this.#set({ folders: null, message: t("event-log.copied", { folder: `${name}/${done.folder}` }), error: "" });
     },
   };
 }
 
-customElements.define("instrument-diary", EventLog);
+customElements.define("instrument-event-log", EventLog);
 
 function view({ entries, warningsOnly, about, folders, message, error }, actions) {
   const shown = (entries ?? []).filter((one) => !warningsOnly || one.level in LEVELS);
   return html`
-    <h2>${t("diary.title")}</h2>
+    <h2>${t("event-log.title")}</h2>
     <div class="row">
-      <button type="button" @click=${actions.again}>${t("diary.again")}</button>
-      <button type="button" aria-pressed=${warningsOnly} @click=${actions.warningsOnly}>${t("diary.worst")}</button>
-      <a class="button" href="/api/technician/diary.txt" download @click=${actions.saved}>${t("diary.save")}</a>
+      <button type="button" @click=${actions.again}>${t("event-log.again")}</button>
+      <button type="button" aria-pressed=${warningsOnly} @click=${actions.warningsOnly}>${t("event-log.worst")}</button>
+      <a class="button" href="/api/technician/event-log.txt" download @click=${actions.saved}>${t("event-log.save")}</a>
       <button type="button" id="to-usb" @click=${actions.listDrives}>${t("film.copy")}</button>
       ${(folders ?? []).map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} ?disabled=${!stick.is_writable} @click=${() => actions.copy(stick)}>
         ${stick.is_writable ? stick.name : t("film.readonly", stick)}
@@ -73,19 +73,19 @@ function view({ entries, warningsOnly, about, folders, message, error }, actions
     </div>
     ${error ? html`<p class="bad" role="alert">${error}</p>` : nothing}
     <p role="note">${message}</p>
-    ${about ? html`<div class="row"><b>${t("diary.about", { about })}</b>
-      <button type="button" @click=${() => actions.showOnly(null)}>${t("diary.all")}</button></div>` : nothing}
-    <p role="status">${entries && (shown.length ? t("diary.count", { n: shown.length }) : t("diary.empty"))}</p>
-    <ol class="diary">${shown.map((one) => entryItem(one, actions, about))}</ol>
+    ${about ? html`<div class="row"><b>${t("event-log.about", { about })}</b>
+      <button type="button" @click=${() => actions.showOnly(null)}>${t("event-log.all")}</button></div>` : nothing}
+    <p role="status">${entries && (shown.length ? t("event-log.count", { n: shown.length }) : t("event-log.empty"))}</p>
+    <ol class="event-log">${shown.map((one) => entryItem(one, actions, about))}</ol>
   `;
 }
 
 const entryItem = (one, actions, about) => html`<li class=${one.level}>
   <p><time datetime=${one.at}>${calendarDay(one.at)}, ${clockTime(one.at)}</time>
-    ${one.level in LEVELS ? html`<b>${LEVELS[one.level]} ${t(`diary.${one.level}`)}</b>` : nothing} ${one.text}</p>
-  ${one.code || one.about || one.detail ? html`<details><summary>${t("diary.more")}</summary>
+    ${one.level in LEVELS ? html`<b>${LEVELS[one.level]} ${t(`event-log.${one.level}`)}</b>` : nothing} ${one.text}</p>
+  ${one.code || one.about || one.detail ? html`<details><summary>${t("event-log.more")}</summary>
     <p>${[one.code, one.about].filter(Boolean).join(" · ")}</p>
     ${one.detail ? html`<pre>${one.detail}</pre>` : nothing}
-    ${one.about && !about ? html`<button type="button" @click=${() => actions.showOnly(one.about)}>${t("diary.only")}</button>` : nothing}
+    ${one.about && !about ? html`<button type="button" @click=${() => actions.showOnly(one.about)}>${t("event-log.only")}</button>` : nothing}
   </details>` : nothing}
 </li>`;

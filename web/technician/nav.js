@@ -13,7 +13,7 @@ const SECTIONS = {
   calibration: null, // drawn by the wizard
   health: html`<instrument-health class="column"></instrument-health>`,
   explorer: html`<accuracy-time class="column"></accuracy-time>`,
-  diary: html`<instrument-diary class="column"></instrument-diary>`,
+  "event-log": html`<instrument-event-log class="column"></instrument-event-log>`,
   backup: html`<instrument-backup class="column"></instrument-backup>`,
   space: html`<stored-pictures class="column"></stored-pictures>`,
   update: html`<software-update class="column"></software-update>`,

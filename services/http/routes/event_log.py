@@ -11,13 +11,13 @@ from services.http.schemas.event_log import EventLogExport, LogEntryAnswer, LogE
 
 
 def event_log_routes(event_log: EventLog, drives: UsbDrives, clock: Clock) -> APIRouter:
-    """Return the router of the event log under /api/technician/diary."""
+    """Return the router of the event log under /api/technician/event-log."""
     router = APIRouter(prefix="/api/technician")
 
     def name() -> str:
-        return f"diary-{clock.wall():%Y-%m-%d}"
+        return f"event-log-{clock.wall():%Y-%m-%d}"
 
-    @router.get("/diary")
+    @router.get("/event-log")
     def entries(limit: int = Query(100, ge=1, le=1000), about: str | None = None) -> LogEntryList:
         """List entries of the event log, the newest first.
 
@@ -25,19 +25,19 @@ def event_log_routes(event_log: EventLog, drives: UsbDrives, clock: Clock) -> AP
         """
         return LogEntryList(entries=[LogEntryAnswer.model_validate(entry) for entry in event_log.entries(limit, about)])
 
-    @router.get("/diary.txt", response_class=TextResponse, responses=file_responses("text/plain"))
+    @router.get("/event-log.txt", response_class=TextResponse, responses=file_responses("text/plain"))
     def download() -> TextResponse:
         """Return the whole event log as plain text, the oldest entry first."""
         headers = {"Content-Disposition": f'attachment; filename="{name()}.txt"'}
         return TextResponse(event_log.as_text(), headers=headers)
 
-    @router.post("/diary/export")
+    @router.post("/event-log/export")
     def copy(away: EventLogExport) -> FolderName:
         """Copy the event log to a USB drive, as text and as JSON lines.
 
         Answers with the name of the new folder; 503 if the drive was removed, 507 if it is full.
         """
-        files = {"diary.txt": event_log.as_text(), "diary.jsonl": event_log.as_jsonl()}
+        files = {"event-log.txt": event_log.as_text(), "event-log.jsonl": event_log.as_jsonl()}
         return FolderName(folder=copy_to_drive(drives.mounted_folder(away.folder), name(), files).name)
 
     return router
