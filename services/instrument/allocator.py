@@ -8,7 +8,7 @@ thread has a heap of its own.
 import ctypes
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # the parameters of `mallopt` in malloc.h
-MAPPED_BYTES = 1 << 20  # half a grid of samples at bin 2; smaller arrays are used again within the heaps
+MAPPED_BYTES = 1 << 22  # frames, not grids of samples, whose arrays are used again within the heaps
 
 
 def return_freed_arrays() -> None:
