@@ -186,7 +186,12 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
         "PREVIEW_PX, False)",
         "quick_look_and_live_picture",
     ),
-    ("services/instrument/capture_pipeline.py", "shot.frame.simulated\n", "False\n", "files_of_a_capture"),
+    (
+        "services/instrument/capture_pipeline.py",
+        "shot.frame.simulated, deadline\n",
+        "False, deadline\n",
+        "files_of_a_capture",
+    ),
     (
         "services/instrument/exam_events.py",
         "to_jpeg(look, THUMBNAIL_PX, simulated)",
