@@ -1,6 +1,8 @@
 """A visit is shown in colour with all of its pictures, or with none: over HTTP, with the reason, and its thumbnails."""
 
 import io
+from concurrent.futures import Future
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -8,11 +10,14 @@ import pytest
 from PIL import Image
 
 from device.ports import Camera
+from services.instrument.events import EventBus
+from services.records.capture_target import CaptureTarget
 from services.records.protocol import load_protocol
 from tests.journey.asking import visit_with_consent
 from tests.journey.conftest import GateClock, MakeRig, Rig
 from tests.red_light import FailsInRed
 
+WAIT_S = 60.0
 SLOTS = ("R-centre", "R-nerve", "L-centre")
 JPEG_DN = 4  # mean difference of a JPEG of quality 70 from its picture, 8-bit levels
 
@@ -101,6 +106,35 @@ def test_a_calibration_without_a_psf_in_red_has_its_reason(make_rig: MakeRig) ->
     visit = begin(rig)
     press(rig, visit, "R-centre")
     assert why_green(rig, visit) == "colour.psf"
+
+
+class HeldBus(EventBus):
+    """Event bus that holds the event `kept` until `go_on`: the capture is stored, and its quick look not forgotten."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kept_id, self.go_on = Future[str](), Event()
+
+    def publish(self, kind: str, **data: Any) -> None:
+        """Publish an event."""
+        if kind == "kept":
+            self.kept_id.set_result(data["id"])
+            assert self.go_on.wait(WAIT_S)
+        super().publish(kind, **data)
+
+
+def test_a_stored_capture_has_its_thumbnail_at_once(make_rig: MakeRig) -> None:
+    """A visit lists it as soon as it is stored; a quick look in green in its place stayed on the page."""
+    bus = HeldBus()
+    rig = make_rig(event_bus=bus)
+    target = CaptureTarget(visit=begin(rig), slot="R-centre")
+    future = rig.exam.press("OD", None, target)
+    id = bus.kept_id.result(WAIT_S)
+    assert rig.exam.quick(id) is not None
+    shown = rig.request("GET", f"/api/captures/{id}/quick.jpg").content
+    bus.go_on.set()
+    assert future.result(WAIT_S).id == id
+    assert shown == rig.store.read(id, "quick.jpg")
 
 
 def pixels(content: bytes) -> Any:

@@ -7,6 +7,7 @@ from pathlib import Path
 from fastapi import APIRouter, Query, Response
 from fastapi import Path as InPath
 
+from services.errors import RecordNotFound
 from services.http.media import file_responses
 from services.http.schemas.captures import CaptureAnswer, CaptureList, NewCapture, capture_answer
 from services.instrument.exam import ExamService
@@ -80,7 +81,12 @@ def captures_router(store: CaptureStore, arbiter: HeadArbiter) -> APIRouter:
         """
         exam = arbiter.current_exam
         quick = exam.quick(id) if name == "quick.jpg" and exam is not None else None
-        content = quick if quick is not None else store.read(id, name)
+        try:
+            content = store.read(id, name)
+        except RecordNotFound:
+            if quick is None:
+                raise
+            content = quick
         return Response(content, media_type=MEDIA_TYPES[Path(name).suffix])
 
     return router
