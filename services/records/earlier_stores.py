@@ -21,7 +21,8 @@ def refuse_earlier_store(database: Path, what: str | None = None) -> None:
     if database.exists():
         # immutable: SQLite neither applies nor removes the write-ahead log. What only the log holds, `migrate` refuses.
         uri = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
-        with suppress(sqlite3.DatabaseError), closing(sqlite3.connect(uri, uri=True)) as tables:
+        # UnicodeDecodeError: of SQLite's message about a damaged definition. What is damaged, recovery.py handles.
+        with suppress(sqlite3.DatabaseError, UnicodeDecodeError), closing(sqlite3.connect(uri, uri=True)) as tables:
             for (revision,) in tables.execute("SELECT version_num FROM alembic_version").fetchall():
                 refuse_earlier_tables(revision, described)
 

@@ -163,3 +163,16 @@ def test_earlier_tables_that_only_the_write_ahead_log_holds_are_not_taken_for_ne
             (tmp_path / "copy" / path.name).write_bytes(path.read_bytes())
     with pytest.raises(StoreError, match=MESSAGE):
         CaptureStore(tmp_path / "copy")
+
+
+def test_tables_whose_definition_is_damaged_are_rebuilt(tmp_path: Path) -> None:
+    """SQLite's message about the definition is then no UTF-8, which Python reports by an error of its own."""
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        store.save(Capture("a", "OD", CLOCK.wall(), True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
+    database = tmp_path / schema.DATABASE
+    definition = b"CREATE TABLE idempotency_keys"
+    assert definition in database.read_bytes()
+    database.write_bytes(database.read_bytes().replace(definition, definition.replace(b"TABLE", b"TABL\xf3")))
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        assert store.recovery.rebuilt_because is not None
+        assert [one.id for one in store.captures()] == ["a"]
