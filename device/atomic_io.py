@@ -173,7 +173,8 @@ def quarantine(stray: Path, quarantine_folder: Path) -> str:
     syncs both parent folders.
     """
     plain = stray.name.removeprefix(".").removesuffix(".part")
-    name, number = plain, 1
+    name = plain
+    number = 1
     while (quarantine_folder / name).exists():
         number += 1
         name = f"{plain}-{number}"

@@ -86,7 +86,8 @@ class Head:
         bus = self.spec.bus
         if bus is None:
             return
-        thermometer, battery = self.chips.thermometer, self.chips.battery
+        thermometer = self.chips.thermometer
+        battery = self.chips.battery
         if thermometer is not None and is_too_hot(warm_c := thermometer.read_c(), bus.warmest_c):
             raise TooHot(f"the head is {warm_c:.0f} C warm, more than {bus.warmest_c:.0f}")
         if battery is not None and is_battery_low((charge := battery.read()).fraction, bus.emptiest):
@@ -119,7 +120,8 @@ def refuse_unsuitable_calibration(kept: StoredCalibration, spec: InstrumentSpec)
     CalibrationModeMismatch for another sensor mode. HeadMismatch for a simulated calibration on a real head, for an
     imported PSF without `imported = true`, and for one without black or white level.
     """
-    found, provenance = kept.calibration, kept.provenance
+    found = kept.calibration
+    provenance = kept.provenance
     refuse_other_mode(found, provenance, spec.camera)
     if found.simulated and not is_simulated(spec):
         raise HeadMismatch(f"{found.id}, of {provenance.serial}, was measured on a simulated head")
@@ -196,7 +198,9 @@ class HeadOpener:
     """Opens the parts of a head one by one; on exit of its context the opened parts are closed in reverse order."""
 
     def __init__(self, spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> None:
-        self.spec, self.clock, self.resources = spec, clock, ExitStack()
+        self.spec = spec
+        self.clock = clock
+        self.resources = ExitStack()
         self._allocator = allocator
 
     def __enter__(self) -> "HeadOpener":
@@ -258,7 +262,8 @@ class HeadOpener:
 
     def _ring(self, chain: ChainSpec | None) -> LedRing:
         """Return the driver of the head's ring with its guardian."""
-        lease_s, sinks = self.spec.light.max_on_s + LEASE_MARGIN_S, self.spec.light.sinks
+        lease_s = self.spec.light.max_on_s + LEASE_MARGIN_S
+        sinks = self.spec.light.sinks
         if self.spec.light.backend == "tlc5971":
             assert sinks is not None
             guardian = Guardian(sinks.device, chip="tlc5971")
@@ -414,7 +419,8 @@ def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Ben
     """Open camera and chips of a head for a calibration, without loading a stored one; SpecError for a recording."""
     refuse_recording(spec)
     with HeadOpener(spec, clock, allocator) as opening:
-        camera, chips = opening.camera(opening.light(MemoryLedger(clock))), opening.chips()
+        camera = opening.camera(opening.light(MemoryLedger(clock)))
+        chips = opening.chips()
         return Bench(
             camera, chips, opening.world if spec.camera.backend == "sim" else None, opening.resources.pop_all()
         )
@@ -438,7 +444,8 @@ def head_memory(spec: InstrumentSpec, clock: Clock) -> Iterator[HeadMemory | Non
 
 def _replayed(opening: HeadOpener, ledger: Ledger) -> Head:
     """Return the opened head of a recording: its camera, a lamp without light, and the recorded calibration."""
-    spec, clock = opening.spec, opening.clock
+    spec = opening.spec
+    clock = opening.clock
     assert spec.replay is not None
     lamp = ReplayLight()
     camera = ReplayCamera(spec.replay, lamp, clock)
@@ -451,17 +458,20 @@ def _replayed(opening: HeadOpener, ledger: Ledger) -> Head:
 
 def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     """Return an opened real or simulated head with its calibration, guarded light, camera, chips and button."""
-    spec, calibration = opening.spec, opening.calibration()
+    spec = opening.spec
+    calibration = opening.calibration()
     facing: Callable[[Eye, str | None], None] = no_repositioning
     lens_placer = card_placer = None
     if spec.camera.backend == "sim":
-        facing, lens_placer = opening.world.present_eye, trial_lens_placer(opening.world)
+        facing = opening.world.present_eye
+        lens_placer = trial_lens_placer(opening.world)
         card_placer = white_card_placer(opening.world)
         facing("OD", None)  # traces the light now, not while a lamp is on
     light = opening.light(ledger)
     camera = opening.camera(light)
     known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None
-    chips, button = opening.chips(), opening.button()
+    chips = opening.chips()
+    button = opening.button()
     return Head(
         spec,
         camera,
@@ -480,7 +490,9 @@ def refuse_mismatched_head(head: Head) -> None:
     """Raise HeadMismatch if the head has a memory that names another calibration or head than is loaded, or none."""
     if head.chips.memory is None:
         return
-    known, loaded, bus = head.chips.memory.read(), head.calibration.id, head.spec.bus
+    known = head.chips.memory.read()
+    loaded = head.calibration.id
+    bus = head.spec.bus
     if known is None and (head.spec.calibration is None or (bus is not None and bus.backend == "sim")):
         return  # never calibrated with a simulated calibration loaded, or a simulated memory, lost with its process
     if known is None or known.calibration_id != loaded:

@@ -106,7 +106,8 @@ def run(
     from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
     from services.research.frontier import measure_scene
 
-    spec, plan = _chosen(head, replay, tuple(raw or ()), tuple(psf or ())), load_protocol(protocol or DEFAULT_PROTOCOL)
+    spec = _chosen(head, replay, tuple(raw or ()), tuple(psf or ()))
+    plan = load_protocol(protocol or DEFAULT_PROTOCOL)
     uploader = HttpsUploader(load_settings(send)) if send is not None else None
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
     address = inherited_socket(os.environ) or bind_socket(host, port)
@@ -202,7 +203,8 @@ def reconstruct(
     from services.research.reconstruct_file import parse_bayer, parse_settings, write_or_raise
     from services.research.reconstruct_inputs import ReconstructOptions
 
-    channels, raws = parse_channels(channel or [], calibration is not None), raw or []
+    channels = parse_channels(channel or [], calibration is not None)
+    raws = raw or []
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
         raws[0] if raws else Path(),
@@ -470,7 +472,8 @@ def show_trial_lenses(
     from services.workshop.trial_lens_check import calibrate_with_lenses
 
     say("the lamp shines for moments: a trainer eye stands before the head, and no person")
-    spec, bench = with_archive(load_head(head), archive), LensBench(vertex_mm, PowerVector(eye_dpt))
+    spec = with_archive(load_head(head), archive)
+    bench = LensBench(vertex_mm, PowerVector(eye_dpt))
     done = calibrate_with_lenses(spec, bench, SystemClock(), _ask_operator, typer.echo)
     typer.echo(f"{done.stored.calibration.id} is in force; reports subtract its offset")
 

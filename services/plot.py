@@ -122,7 +122,8 @@ def time_axis(seconds: Iterable[float], title: str) -> Axis:
 def log_axis(values: Iterable[float], title: str, label: Callable[[float], str]) -> Axis:
     """Return a log axis for positive values with ticks at 1, 2 and 5 of each decade; `label` formats a tick."""
     every = list(values)
-    low, high = min(every) / 1.25, max(every) * 1.45
+    low = min(every) / 1.25
+    high = max(every) * 1.45
     ticks = [m * 10.0**k for k in range(floor(log10(low)), ceil(log10(high)) + 1) for m in (1, 2, 5)]
     return Axis(low, high, title, tuple((tick, label(tick)) for tick in ticks if low <= tick <= high), log=True)
 
@@ -135,7 +136,8 @@ def value_axis(values: Iterable[float], title: str, room: float = 0.06) -> Axis:
     """Return a linear axis, wider than its values by the share `room` at each end, with at most nine round ticks."""
     every = list(values)
     span = max(max(every) - min(every), 1e-6)
-    low, high = min(every) - room * span, max(every) + room * span
+    low = min(every) - room * span
+    high = max(every) + room * span
     step = next(s for k in range(-9, 9) for s in (10.0**k, 2 * 10.0**k, 5 * 10.0**k) if (high - low) / s <= 8)
     first = ceil(low / step)
     ticks = [(k * step, f"{k * step:.6g}") for k in range(first, floor(high / step) + 1)]
@@ -153,8 +155,10 @@ def stacked_svg(plots: Sequence[Plot], between: Sequence[Panel] = ()) -> str:
     Panels stand `between` the first plot and the others.
     """
     every: list[Plot | Panel] = [plots[0], *between, *plots[1:]]
-    wide, tall = max(one.width for one in every), sum(one.height for one in every)
-    panels, down = [], 0
+    wide = max(one.width for one in every)
+    tall = sum(one.height for one in every)
+    panels = []
+    down = 0
     for one in every:
         elements = _elements(one) if isinstance(one, Plot) else one.elements
         panels += [f'<g transform="translate(0 {down})">', *elements, "</g>"]
@@ -222,7 +226,8 @@ def _upright(x: float, y: float, words: str) -> str:
 
 
 def _frame(plot: Plot) -> list[str]:
-    low, high = plot.height - BOTTOM, plot.width - RIGHT
+    low = plot.height - BOTTOM
+    high = plot.width - RIGHT
     out = []
     for value, words in plot.x.ticks:
         at = _x(plot, value)
@@ -323,7 +328,8 @@ def _ring(plot: Plot) -> list[str]:
 
 def _legend(plot: Plot) -> list[str]:
     """Return one row above the frame: shape and name of each series, then the Pareto edge and the ring."""
-    out, at = [], float(LEFT + 6)
+    out = []
+    at = float(LEFT + 6)
     for k, series in _by_kind(plot):
         if not series.named:
             continue
@@ -352,10 +358,12 @@ def _labels(plot: Plot) -> list[str]:
         (_x(plot, m.x) - 6, _y(plot, m.y) - 6, _x(plot, m.x) + 6, _y(plot, m.y) + 6) for m in _marks(plot)
     ]
     if plot.ring is not None:
-        x, y = _x(plot, plot.ring[0]), _y(plot, plot.ring[1])
+        x = _x(plot, plot.ring[0])
+        y = _y(plot, plot.ring[1])
         taken.append((x - 13, y - 13, x + 13, y + 13))
     if plot.limit is not None:
-        x, y = _x(plot, plot.limit[0]), plot.height - BOTTOM - 8
+        x = _x(plot, plot.limit[0])
+        y = plot.height - BOTTOM - 8
         taken.append((x - GAP_PX, y - LINE_PX, x + 6 + LETTER_PX * len(plot.limit[1]) + GAP_PX, y + GAP_PX))
     labelled = [(k, mark) for k, series in _by_kind(plot) for trail in series.trails for mark in trail if mark.label]
     out = []
@@ -377,8 +385,12 @@ def _free_position(
     x: float, y: float, wide: float, reach: Sequence[int], taken: Sequence[Box], plot: Plot
 ) -> Box | None:
     for near in reach:
-        right, left, middle = x + 10 + near, x - 10 - near - wide, x - wide / 2
-        over, under, level = y - 7 - near - LINE_PX, y + 8 + near, y - LINE_PX / 2
+        right = x + 10 + near
+        left = x - 10 - near - wide
+        middle = x - wide / 2
+        over = y - 7 - near - LINE_PX
+        under = y + 8 + near
+        level = y - LINE_PX / 2
         for a, b in (
             (middle, over),
             (middle, under),

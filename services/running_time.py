@@ -21,9 +21,12 @@ class RunningTime:
     """Durations of a computation in seconds: of all of it, and of the compilation of kernels within it."""
 
     def __init__(self, clock: Clock) -> None:
-        self._clock, self._begin_s = clock, clock.now_s()
-        self._depth, self._compile_begin_s = 0, 0.0
-        self.compiles, self.compiled_s = False, 0.0
+        self._clock = clock
+        self._begin_s = clock.now_s()
+        self._depth = 0
+        self._compile_begin_s = 0.0
+        self.compiles = False
+        self.compiled_s = 0.0
 
     @property
     def seconds(self) -> float:
@@ -40,7 +43,8 @@ class RunningTime:
         """Note that a kernel begins to be compiled; one may need another."""
         if self._depth == 0:
             self._compile_begin_s = self._clock.now_s()
-        self._depth, self.compiles = self._depth + 1, True
+        self._depth = self._depth + 1
+        self.compiles = True
 
     def end_kernel(self) -> None:
         """Note that a kernel is compiled."""
@@ -88,7 +92,8 @@ def working(doing: str, progress: Callable[[str], None] = say, clock: Clock | No
 @contextmanager
 def announcing(doing: str, progress: Callable[[str], None] = say, clock: Clock | None = None) -> Iterator[RunningTime]:
     """Call `progress` with `doing` and its duration, from FIRST_S on, until the end; kernels are not looked at."""
-    beat, ended = RunningTime(clock or SystemClock()), Event()
+    beat = RunningTime(clock or SystemClock())
+    ended = Event()
     thread = Thread(target=_report, args=(doing, progress, beat, ended), name="progress", daemon=True)
     thread.start()
     try:

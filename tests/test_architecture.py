@@ -32,8 +32,8 @@ from tests.project_files import (
     text,
 )
 
-MOST_FUNCTION_LINES, MOST_COMPLEXITY = 40, 10
-MOST_METHODS, MOST_ATTRIBUTES = 15, 16
+MAX_FUNCTION_LINES, MAX_COMPLEXITY = 40, 10
+MAX_METHODS, MAX_ATTRIBUTES = 15, 16
 
 
 # Imports
@@ -130,7 +130,7 @@ def long_functions(source: str) -> Iterator[Violation]:
     for node in nodes(source):
         if isinstance(node, Function):
             lines = statement_lines(node, source)
-            if lines > MOST_FUNCTION_LINES and size_reason(source, node.lineno) is None:
+            if lines > MAX_FUNCTION_LINES and size_reason(source, node.lineno) is None:
                 yield node.lineno, node.name, f"{lines} lines"
 
 
@@ -162,9 +162,9 @@ def large_classes(source: str) -> Iterator[Violation]:
     for node in nodes(source):
         if isinstance(node, ast.ClassDef) and size_reason(source, node.lineno) is None:
             methods = sum(isinstance(one, Function) for one in node.body)
-            if methods > MOST_METHODS:
+            if methods > MAX_METHODS:
                 yield node.lineno, node.name, f"{methods} methods"
-            elif len(attributes(node)) > MOST_ATTRIBUTES and not is_value(node):
+            elif len(attributes(node)) > MAX_ATTRIBUTES and not is_value(node):
                 yield node.lineno, node.name, f"{len(attributes(node))} attributes"
 
 
@@ -199,7 +199,7 @@ def test_functions_have_few_branches() -> None:
     """Ruff reports a function of cyclomatic complexity above 10; an exception of any limit carries its reason."""
     lint = tomllib.loads(text("pyproject.toml"))["tool"]["ruff"]["lint"]
     assert "C90" in lint["select"]
-    assert lint["mccabe"]["max-complexity"] == MOST_COMPLEXITY
+    assert lint["mccabe"]["max-complexity"] == MAX_COMPLEXITY
     check_rule(size_comments, python_files("device", "services"), {}, "state the reason of the size")
 
 
@@ -212,7 +212,7 @@ def long_js_functions(source: str) -> Iterator[Violation]:
     for first, line in enumerate(lines):
         if (head := JS_FUNCTION.match(line)) and ("=>" in line or "(" in line):
             end = next((i for i in range(first + 1, len(lines)) if lines[i].startswith(f"{head[1]}}}")), first)
-            if end - first + 1 > MOST_FUNCTION_LINES:
+            if end - first + 1 > MAX_FUNCTION_LINES:
                 yield first + 1, head[2], f"{end - first + 1} lines"
 
 

@@ -264,20 +264,20 @@ def test_every_folder_has_a_readme() -> None:
     assert not sorted(one for one in folders if f"{one}/README.md" not in files()), "folders without a README"
 
 
-MOST_README_LINES, MOST_DECISION_LINES = 60, 25
+MAX_README_LINES, MAX_DECISION_LINES = 60, 25
 
 
 @pytest.mark.parametrize("readme", [name for name in readmes() if name != "README.md"])
 def test_a_readme_is_short(readme: str) -> None:
     """A README has a purpose, a map of subfolders and how to extend; the docstring of a module describes the module."""
-    assert text(readme).count("\n") <= MOST_README_LINES
+    assert text(readme).count("\n") <= MAX_README_LINES
 
 
 @pytest.mark.parametrize("decision", [name for name in files() if "/decisions/" in name])
 def test_a_decision_is_one_short_numbered_file(decision: str) -> None:
     """A decision record has a number, a title, context, decision and consequences."""
     assert re.fullmatch(r"\d{4}-[a-z0-9-]+\.md", Path(decision).name)
-    assert text(decision).count("\n") <= MOST_DECISION_LINES
+    assert text(decision).count("\n") <= MAX_DECISION_LINES
 
 
 @pytest.mark.parametrize("folder", [one for one in TOP_FOLDERS if f"{one}/README.md" in files()])

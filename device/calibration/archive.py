@@ -41,7 +41,8 @@ from device.values import Calibration, Colour, Geometry, Psf, RefractionOffset, 
 MANIFEST, CURRENT = "manifest.toml", "current"
 MAPS = ("dark_dn", "flat", "bad")
 FORMAT = 1
-ID, NAME = re.compile("[0-9a-f]{16}"), re.compile(r"[a-z][a-z0-9_]*\.(npy|toml)")
+ID = re.compile("[0-9a-f]{16}")
+NAME = re.compile(r"[a-z][a-z0-9_]*\.(npy|toml)")
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,8 @@ def parse_calibration(files: Mapping[str, bytes]) -> StoredCalibration:
     """
     try:
         manifest = _parse_manifest(files)
-        id, names = str(manifest["id"]), {MANIFEST, *manifest["sha256"]}
+        id = str(manifest["id"])
+        names = {MANIFEST, *manifest["sha256"]}
     except _PARSE_ERRORS as error:
         raise CalibrationDamaged(f"this is not a whole calibration: {error}") from error
     if set(files) != names or not all(NAME.fullmatch(name) for name in names):
@@ -274,7 +276,9 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
     return stored
 
 
-_BOOL, _NUMBERS, _PROVENANCE = TypeAdapter(bool), TypeAdapter(dict[str, float | None]), TypeAdapter(Provenance)
+_BOOL = TypeAdapter(bool)
+_NUMBERS = TypeAdapter(dict[str, float | None])
+_PROVENANCE = TypeAdapter(Provenance)
 _COLOUR: TypeAdapter[Colour] = TypeAdapter(Colour)
 _WHITE: TypeAdapter[dict[Colour, float]] = TypeAdapter(dict[Colour, float])
 _PARSE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, RecursionError)

@@ -15,7 +15,7 @@ EXPIRES_AFTER = timedelta(weeks=61)
 CLOCK_SLACK = timedelta(days=1)  # a date further in the future means a wrong computer clock: the age is unknown
 
 PITCH_SHARE = 1e-3
-LEAST_WHITE = 0.55  # of the converter range: wells may saturate earlier; one bit less would be 0.5
+MIN_WHITE = 0.55  # of the converter range: wells may saturate earlier; one bit less would be 0.5
 BLACK_DN, BLACK_SHARE = 16.0, 0.5  # one bit more or less would double or halve the black level
 DARK_MAP_DN, DARK_MAP_SHARE = 3.0, 0.5  # share of the dark current: a larger difference means another exposure
 
@@ -68,7 +68,8 @@ def refuse_other_mode(calibration: Calibration, provenance: Provenance, camera: 
 
 def _other_mode(calibration: Calibration, known: Provenance, camera: CameraSpec) -> str | None:
     """Return the first difference in shape, pitch, white or black level, or dark exposure as a sentence; else None."""
-    sensor, geometry = calibration.sensor, calibration.geometry
+    sensor = calibration.sensor
+    geometry = calibration.geometry
     maps = [one for one in (calibration.dark_dn, calibration.flat, calibration.bad) if one is not None]
     for rows, cols in (one.shape for one in (*calibration.psfs, *maps)):
         if (rows, cols) != (camera.rows, camera.cols):
@@ -77,7 +78,7 @@ def _other_mode(calibration: Calibration, known: Provenance, camera: CameraSpec)
         return f"has pixels of {geometry.pitch_um:g} um, the head's file {camera.pitch_um:g} um"
     if sensor.gain_e_per_dn is None:  # the sensor was not measured
         return None
-    if not LEAST_WHITE * camera.white_dn < sensor.white_dn <= camera.white_dn:
+    if not MIN_WHITE * camera.white_dn < sensor.white_dn <= camera.white_dn:
         return f"is full at {sensor.white_dn:.0f} DN, the head's file at {camera.white_dn} DN"
     if abs(sensor.black_dn - camera.black_dn) > max(BLACK_DN, BLACK_SHARE * camera.black_dn):
         return f"is black at {sensor.black_dn:.1f} DN, the head's file at {camera.black_dn:g} DN"
@@ -86,7 +87,8 @@ def _other_mode(calibration: Calibration, known: Provenance, camera: CameraSpec)
 
 def _other_exposure(calibration: Calibration, known: Provenance, camera: CameraSpec) -> str | None:
     """Return a sentence if the level of the dark map contradicts the exposure of pictures; None if not, or unknown."""
-    per_s, gain = dict(known.figures).get("dark_e_per_s"), calibration.sensor.gain_e_per_dn
+    per_s = dict(known.figures).get("dark_e_per_s")
+    gain = calibration.sensor.gain_e_per_dn
     if per_s is None or gain is None or calibration.dark_dn is None:
         return None
     good = slice(None) if calibration.bad is None else ~calibration.bad

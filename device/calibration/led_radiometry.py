@@ -32,7 +32,7 @@ POWER_MW = (1e-4, 1.0)
 WAIST_MW_PER_CM2 = (1e-2, 130.0)
 MIN_POWER_SHARE = 0.25  # of the strongest of the same colour: a weaker LED is broken or was misaligned with the meter
 MAX_METER_RATIO = 1.3  # largest ratio between two readings of one beam
-MOST_CENTRE_OVER_MEAN = 1.4  # highest irradiance of a retina over that of the power spread evenly (OPTICS.md 4.9)
+MAX_CENTRE_OVER_MEAN = 1.4  # highest irradiance of a retina over that of the power spread evenly (OPTICS.md 4.9)
 EYE_MM = 17.0  # focal length of the eye model of the exposure limits
 COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
 
@@ -186,7 +186,7 @@ def _beam(readings: list[_StoredReading | None], trims: tuple[float, ...], field
     waists = [waist for _, _, waist in known if waist is not None]
     if not len(powers) == len(waists) == len(trims):
         return None
-    lit_cm2 = pi * (EYE_MM / 10 * tan(radians(field_deg / 2))) ** 2 / MOST_CENTRE_OVER_MEAN
+    lit_cm2 = pi * (EYE_MM / 10 * tan(radians(field_deg / 2))) ** 2 / MAX_CENTRE_OVER_MEAN
     return BeamSpec(
         wavelength_um=min(nm for nm, _, _ in known) / 1000,
         retina_mw_per_cm2=sum(trim * mw for trim, mw in zip(trims, powers, strict=True)) / lit_cm2,

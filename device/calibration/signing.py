@@ -32,10 +32,11 @@ from cryptography.hazmat.primitives.serialization import (
 from device import atomic_io
 from device.errors import CalibrationDamaged, CalibrationFormat, CalibrationUntrusted, SettingError
 
-MAGIC, FORMAT = "diffuscope-calibration", 1
-MOST_BYTES = 2**30  # eleven PSFs of twelve megapixels are 0.6 of it
+MAGIC = "diffuscope-calibration"
+FORMAT = 1
+MAX_BYTES = 2**30  # eleven PSFs of twelve megapixels are 0.6 of it
 SIGNATURE = re.compile("[0-9a-f]{128}")
-MOST_FILES, LONGEST_LINE = 64, 256
+MAX_FILES, LONGEST_LINE = 64, 256
 RETRY_REMEDY = "Copy the file again, or ask the service centre for it again."
 
 
@@ -59,7 +60,8 @@ def create_key_pair(path: Path, name: str) -> Signer:
     """
     signer_name = _checked_name(name)
     key = Ed25519PrivateKey.generate()
-    signer, beside = Signer(signer_name, key.public_key()), _public_path(path)
+    signer = Signer(signer_name, key.public_key())
+    beside = _public_path(path)
     if path.exists() or beside.exists():
         raise SettingError(f"{path} or {beside} is there already", "Choose another name: a key is never overwritten.")
     try:
@@ -97,7 +99,7 @@ def export(files: Mapping[str, bytes], path: Path, private: Path) -> Signer:
             f"{_public_path(private)} is not the public key of {private}", "Put the right one beside it."
         )
     packed = _zip_archive(files)
-    if len(packed) > MOST_BYTES - 4 * LONGEST_LINE:
+    if len(packed) > MAX_BYTES - 4 * LONGEST_LINE:
         raise SettingError(
             f"this calibration has {len(packed) / 1e6:.0f} MB, too many for one file", "Keep fewer PSFs."
         )
@@ -117,11 +119,11 @@ def read_export(path: Path, trusted: tuple[Signer, ...]) -> tuple[dict[str, byte
     """
     try:
         with path.open("rb") as file:
-            whole = file.read(MOST_BYTES + 1) if os.fstat(file.fileno()).st_size <= MOST_BYTES else None
+            whole = file.read(MAX_BYTES + 1) if os.fstat(file.fileno()).st_size <= MAX_BYTES else None
     except OSError as error:
         raise SettingError(f"{path} cannot be read: {error.strerror}", "Give the path of an exported file.") from error
-    if whole is None or len(whole) > MOST_BYTES:
-        raise CalibrationDamaged(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB, as no calibration is", RETRY_REMEDY)
+    if whole is None or len(whole) > MAX_BYTES:
+        raise CalibrationDamaged(f"{path} is larger than {MAX_BYTES / 1e6:.0f} MB, as no calibration is", RETRY_REMEDY)
     return verify_export(whole, path.name, trusted)
 
 
@@ -153,7 +155,8 @@ def verify_export(whole: bytes, name: str, trusted: tuple[Signer, ...]) -> tuple
 
 def _split_header(whole: bytes, name: str) -> tuple[str, str, str, str, bytes]:
     """Return type line, fingerprint, displayable signer name, signature and zip archive; CalibrationDamaged."""
-    lines, at = [], 0
+    lines = []
+    at = 0
     for _ in range(4):
         end = whole.find(b"\n", at, at + LONGEST_LINE)
         if end < 0:
@@ -183,7 +186,7 @@ def _unzip(packed: bytes, name: str) -> dict[str, bytes]:
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             held = archive.infolist()
-            if len(held) > MOST_FILES or len({one.filename for one in held}) < len(held):
+            if len(held) > MAX_FILES or len({one.filename for one in held}) < len(held):
                 raise CalibrationDamaged(f"{name} holds more files than a calibration has", RETRY_REMEDY)
             if any(one.compress_type != zipfile.ZIP_STORED for one in held):
                 raise CalibrationDamaged(f"{name} holds compressed files, as no calibration does", RETRY_REMEDY)

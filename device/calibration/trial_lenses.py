@@ -29,14 +29,14 @@ TRIAL_LENSES = (
 )
 LENS_SD_DPT = 0.06  # tolerance of a trial lens up to 6 dpt, ISO 9801 [unchecked]
 VERTEX_SD_MM = 1.0  # of a distance taken with a ruler: 0.025 dpt at 5 dpt
-LEAST_SPHERES = 3  # different ones: two fix the line, and one judges it
-MOST_OFFSET_DPT = 0.5  # three times 0.16 dpt, a point source 0.1 mm out of the focus of a 25 mm lens
-MOST_CYLINDER_OFFSET_DPT = 0.25  # of J0 or J45: repeatability of an autorefractor, ISO 10342
-MOST_SLOPE_ERROR = 0.05  # 0.25 dpt at 5 dpt, the same repeatability
-MOST_RESIDUAL_DPT, MOST_RESIDUAL_SDS = 0.25, 3.0
-MOST_CYLINDER_ERROR_DPT = 0.25
-MOST_AXIS_ERROR_DEG = 5.0  # of a cylinder of 2 dpt: 0.35 dpt of wrong cylinder
-MOST_OFFSET_SD_DPT, MOST_SLOPE_SD = 0.12, 0.025  # a quarter, and half of their limits: else nothing is judged
+MIN_SPHERES = 3  # different ones: two fix the line, and one judges it
+MAX_OFFSET_DPT = 0.5  # three times 0.16 dpt, a point source 0.1 mm out of the focus of a 25 mm lens
+MAX_CYLINDER_OFFSET_DPT = 0.25  # of J0 or J45: repeatability of an autorefractor, ISO 10342
+MAX_SLOPE_ERROR = 0.05  # 0.25 dpt at 5 dpt, the same repeatability
+MAX_RESIDUAL_DPT, MAX_RESIDUAL_SDS = 0.25, 3.0
+MAX_CYLINDER_ERROR_DPT = 0.25
+MAX_AXIS_ERROR_DEG = 5.0  # of a cylinder of 2 dpt: 0.35 dpt of wrong cylinder
+MAX_OFFSET_SD_DPT, MAX_SLOPE_SD = 0.12, 0.025  # a quarter, and half of their limits: else nothing is judged
 WORDS = {
     "offset": "the refraction is off by {value:+.2f} dpt",
     "offset_j0": "J0 is off by {value:+.2f} dpt",
@@ -137,9 +137,9 @@ def refuse_beyond_limits(fit: TrialLensFit) -> None:
 def _refuse_unusable(readings: Sequence[LensReading]) -> None:
     spheres = {one.lens.sphere_dpt for one in readings if not one.lens.cylinder_dpt}
     cylinders = sum(1 for one in readings if one.lens.cylinder_dpt)
-    if len(spheres) < LEAST_SPHERES or cylinders != 1:
+    if len(spheres) < MIN_SPHERES or cylinders != 1:
         raise CalibrationRefused(
-            f"{len(spheres)} spheres and {cylinders} cylinders were read, instead of {LEAST_SPHERES} or more and 1",
+            f"{len(spheres)} spheres and {cylinders} cylinders were read, instead of {MIN_SPHERES} or more and 1",
             "Show every lens that is asked for, once.",
         )
     for one in readings:
@@ -191,7 +191,8 @@ def _judged(fit: TrialLensFit, line: _Line, readings: Sequence[LensReading]) -> 
     """Return the fit with its findings: precision first, because a limit is judged only by what is known."""
     worst = int(np.argmax(np.abs(fit.residuals_dpt) / line.sds_dpt))
     lens = readings[worst].lens.label
-    off, again = fit.offset, "More light, or a trainer eye with more vessels, then show the lenses again."
+    off = fit.offset
+    again = "More light, or a trainer eye with more vessels, then show the lenses again."
     focus = (
         "Set the trainer eye to 0 dpt, or give the correction that it alone needs. If that is right, the calibration's "
         "point source was out of focus: calibrate the head again."
@@ -203,17 +204,17 @@ def _judged(fit: TrialLensFit, line: _Line, readings: Sequence[LensReading]) -> 
         "Turn the cylinder to the axis that is asked for, handle as the examiner sees it. If it is, the picture is "
         "turned or mirrored: look at `upright` in the head file."
     )
-    residual_limit = max(MOST_RESIDUAL_DPT, MOST_RESIDUAL_SDS * float(line.sds_dpt[worst]))
+    residual_limit = max(MAX_RESIDUAL_DPT, MAX_RESIDUAL_SDS * float(line.sds_dpt[worst]))
     rows = (
-        ("offset_sd", max(off.m_sd_dpt, off.j0_sd_dpt, off.j45_sd_dpt), MOST_OFFSET_SD_DPT, "dpt", again),
-        ("slope_sd", fit.slope_sd, MOST_SLOPE_SD, "share", again),
+        ("offset_sd", max(off.m_sd_dpt, off.j0_sd_dpt, off.j45_sd_dpt), MAX_OFFSET_SD_DPT, "dpt", again),
+        ("slope_sd", fit.slope_sd, MAX_SLOPE_SD, "share", again),
         ("line", fit.residuals_dpt[worst], residual_limit, "dpt", distance),
-        ("slope", fit.slope - 1, MOST_SLOPE_ERROR, "share", slope),
-        ("offset", off.m_dpt, MOST_OFFSET_DPT, "dpt", focus),
-        ("offset_j0", off.j0_dpt, MOST_CYLINDER_OFFSET_DPT, "dpt", oblique),
-        ("offset_j45", off.j45_dpt, MOST_CYLINDER_OFFSET_DPT, "dpt", oblique),
-        ("axis", fit.axis_error_deg, MOST_AXIS_ERROR_DEG, "deg", turned),
-        ("cylinder", fit.cylinder_error_dpt, MOST_CYLINDER_ERROR_DPT, "dpt", "Look at the lens, and show it again."),
+        ("slope", fit.slope - 1, MAX_SLOPE_ERROR, "share", slope),
+        ("offset", off.m_dpt, MAX_OFFSET_DPT, "dpt", focus),
+        ("offset_j0", off.j0_dpt, MAX_CYLINDER_OFFSET_DPT, "dpt", oblique),
+        ("offset_j45", off.j45_dpt, MAX_CYLINDER_OFFSET_DPT, "dpt", oblique),
+        ("axis", fit.axis_error_deg, MAX_AXIS_ERROR_DEG, "deg", turned),
+        ("cylinder", fit.cylinder_error_dpt, MAX_CYLINDER_ERROR_DPT, "dpt", "Look at the lens, and show it again."),
     )
     findings = tuple(
         Finding(name, abs(value) <= limit, value, limit, unit, "" if abs(value) <= limit else remedy)

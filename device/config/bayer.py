@@ -20,7 +20,7 @@ PATTERNS: tuple[Bayer, ...] = ("rggb", "bggr", "grbg", "gbrg")
 SITES = ((0, 0), (0, 1), (1, 0), (1, 1))  # row and column of the letters of a pattern
 TILES = 8  # per side, of the test for a mosaic
 MIN_SIZE = 4 * TILES  # rows and columns of the smallest frame that the test can judge
-LEAST_CONTRAST = 0.05  # of the four sites, over their mean; a monochrome frame has 0.01 and less
+MIN_CONTRAST = 0.05  # of the four sites, over their mean; a monochrome frame has 0.01 and less
 
 
 def split(mosaic: NDArray[Any], pattern: Bayer, white_dn: float = float("inf")) -> Image:
@@ -70,7 +70,7 @@ def looks_like_mosaic(frame: NDArray[Any]) -> bool:
     contrast = float(np.ptp(typical))
     steady = float(np.median(np.abs(ratios - typical[:, None]))) < 0.5 * contrast
     greens = min(abs(typical[0] - typical[3]), abs(typical[1] - typical[2]))
-    return contrast > LEAST_CONTRAST and steady and float(greens) < 0.5 * contrast
+    return contrast > MIN_CONTRAST and steady and float(greens) < 0.5 * contrast
 
 
 def pattern_of(

@@ -345,7 +345,8 @@ def _refuse_pupil_beside_iris(path: Path, spec: InstrumentSpec) -> None:
     """Raise SpecError for a simulated pupil so far off the axis that its image misses the iris and no light passes."""
     if spec.sim is None or spec.optics is None:
         return
-    eye, iris_um = spec.sim.eye, spec.optics.iris_um * spec.optics.angular_magnification
+    eye = spec.sim.eye
+    iris_um = spec.optics.iris_um * spec.optics.angular_magnification
     most_um = (eye.pupil_um + iris_um) / 2
     if eye.decentred_um >= most_um:
         raise SpecError(

@@ -161,7 +161,9 @@ def _named_array(path: Path) -> tuple[Path, str | None]:
 
 def _decoded(path: Path, data: bytes, name: str | None) -> ImageFile:
     """Return the content of a file, decoded by its suffix; FrameError if damaged, or for what is not applied."""
-    suffix, levels, encoding = path.suffix.lower(), NOT_STATED, None
+    suffix = path.suffix.lower()
+    levels = NOT_STATED
+    encoding = None
     if suffix not in READABLE:
         raise FrameError(
             f"{path}: the ending '{path.suffix}' is not one of {', '.join(READABLE)}",
@@ -177,7 +179,9 @@ def _decoded(path: Path, data: bytes, name: str | None) -> ImageFile:
                 pixels, encoding = read_png(data, str(path))
             case _:
                 tiff = read_tiff(data, str(path), dng=suffix == ".dng")
-                pixels, levels, encoding = tiff.pixels, tiff.levels, tiff.encoding
+                pixels = tiff.pixels
+                levels = tiff.levels
+                encoding = tiff.encoding
     except FrameError:
         raise
     except _DECODER_ERRORS as error:
@@ -216,7 +220,8 @@ def _decode_npz(path: Path, data: bytes, name: str | None) -> Pixels:
         if name is None and len(members) == 1:
             name = next(iter(members))
         if name not in members:
-            held, first = ", ".join(members) or "no array", next(iter(members), "NAME")
+            held = ", ".join(members) or "no array"
+            first = next(iter(members), "NAME")
             raise FrameError(f"{path} holds {held}", f"Name the array that is meant, as in {path.name}:{first}.")
         return _loaded(BytesIO(archive.read(members[name])), f"{path}:{name}")
 

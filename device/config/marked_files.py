@@ -33,7 +33,7 @@ from device.values import Image
 
 KEY, LETTERS, MANIFEST = "simulated", "SIMULATED", "manifest.toml"
 _LETTER_RATIO = 1 / 18  # letter size of the band over picture height: legible on a telephone at arm's length
-_LETTER_LEAST_PX = 12.0  # smaller letters touch each other
+_LETTER_MIN_PX = 12.0  # smaller letters touch each other
 _WORDS = {True: "true", False: "false"}
 _UNREADABLE = (
     OSError,
@@ -227,10 +227,12 @@ def with_band(pixels: Pixels, text: str, ratio: float, *, at_right: bool = False
 @lru_cache(maxsize=16)
 def _band(rows: int, cols: int, text: str, ratio: float) -> Pixels:
     """Return a mark (text, white on black, grey pixels) for a picture of rows x cols, not larger than it."""
-    size = max(_LETTER_LEAST_PX, rows * ratio)
+    size = max(_LETTER_MIN_PX, rows * ratio)
     size = max(1.0, size * min(1.0, cols / _lengths(text, size)[-1]))
-    font, ends = ImageFont.load_default(size), _lengths(text, size)
-    width, height = min(cols, round(ends[-1])), min(rows, round(1.25 * size))
+    font = ImageFont.load_default(size)
+    ends = _lengths(text, size)
+    width = min(cols, round(ends[-1]))
+    height = min(rows, round(1.25 * size))
     band = Pillow.new("L", (width, height), 0)
     for letter, end in zip(text, ends, strict=False):  # the last value is the right margin
         ImageDraw.Draw(band).text((end, height / 2), letter, fill=255, font=font, anchor="rm")
@@ -239,6 +241,7 @@ def _band(rows: int, cols: int, text: str, ratio: float) -> Pixels:
 
 def _lengths(text: str, size: float) -> list[float]:
     """Return the right end of each letter of a mark, and last the width of its band, pixels; `size`: letter size."""
-    font, gap = ImageFont.load_default(size), 0.15 * size
+    font = ImageFont.load_default(size)
+    gap = 0.15 * size
     ends = list(accumulate((font.getlength(letter) + gap for letter in text), initial=0.3 * size))
     return [*ends[1:], ends[-1] + 0.45 * size]

@@ -15,7 +15,7 @@ from device.config.toml_file import Table, check_table
 WIDEST_GAZE_DEG = 30.0
 STEEPEST_RETINA_DEG = 30.0
 FARTHEST_RETINA_UM = 3000.0
-MOST_PEAK_E = 1e7
+MAX_PEAK_E = 1e7
 T = TypeVar("T", bound=Table)
 
 
@@ -203,11 +203,11 @@ def _require_tables(effects: object) -> object:
 
 
 def _check_peak(peak_e: object) -> object:
-    """Return a peak unchanged; ValueError unless it is "budget" or a number above 0 and up to MOST_PEAK_E."""
-    number = isinstance(peak_e, int | float) and not isinstance(peak_e, bool) and 0 < peak_e <= MOST_PEAK_E
+    """Return a peak unchanged; ValueError unless it is "budget" or a number above 0 and up to MAX_PEAK_E."""
+    number = isinstance(peak_e, int | float) and not isinstance(peak_e, bool) and 0 < peak_e <= MAX_PEAK_E
     if peak_e != "budget" and not number:
         raise ValueError(
-            f'{peak_e!r} is neither a number of electrons above 0 and up to {MOST_PEAK_E:g} nor "budget"; give the '
+            f'{peak_e!r} is neither a number of electrons above 0 and up to {MAX_PEAK_E:g} nor "budget"; give the '
             'electrons of the brightest pixel, or "budget" for a human eye in the light of the head\'s LEDs'
         )
     return peak_e

@@ -218,7 +218,8 @@ def looked_up(indices: Pixels, table: NDArray[np.uint16]) -> Pixels:
     if used[-1] >= len(table):
         raise ValueError(f"the index {used[-1]} lies beyond the palette of {len(table)} colours")
     entries = table[used]
-    low, high = entries & np.uint16(255), entries >> np.uint16(8)
+    low = entries & np.uint16(255)
+    high = entries >> np.uint16(8)
     if (low == high).all() or not low.any():
         table = (table >> np.uint16(8)).astype(np.uint8)
     grey = bool((entries == entries[:, :1]).all())

@@ -22,7 +22,8 @@ Pixels = NDArray[Any]
 MAX_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
 MAX_COMPRESSION_RATIO = 1100  # maximum compression ratio of a deflated black frame (zlib: 1032)
 _NONE, _LZW, _DEFLATE, _OLD_DEFLATE, _PACK_BITS, _LZMA, _ZSTD = 1, 5, 8, 32946, 32773, 34925, 50000
-_LOSSY, _JPEG = (6, 34892), 7  # JPEG: with loss, but for raw images, in which it is lossless
+_LOSSY = (6, 34892)  # JPEG: with loss, but for raw images, in which it is lossless
+_JPEG = 7
 _OF_RAW = (tifffile.PHOTOMETRIC.CFA, tifffile.PHOTOMETRIC.LINEAR_RAW)
 _OF_LIBTIFF = (_LZW, _PACK_BITS, _LZMA, _ZSTD)
 _PREDICTED = (_LZW, _DEFLATE, _OLD_DEFLATE, _LZMA, _ZSTD)  # codecs that a predictor may precede
@@ -38,7 +39,9 @@ def stored_values(page: tifffile.TiffPage, name: str) -> Pixels:
     """
     dtype = _dtype(page, name)
     _refuse_coding(page, name)
-    rows, cols, samples = page.imagelength, page.imagewidth, page.samplesperpixel
+    rows = page.imagelength
+    cols = page.imagewidth
+    samples = page.samplesperpixel
     planes, in_segment = (samples, 1) if page.planarconfig == 2 else (1, samples)
     height = page.tilelength if page.is_tiled else min(page.rowsperstrip, rows)
     width = page.tilewidth if page.is_tiled else cols
@@ -46,7 +49,8 @@ def stored_values(page: tifffile.TiffPage, name: str) -> Pixels:
     _require_size(page, grid, height * width * in_segment)
     values = np.empty((rows, cols, samples), dtype)
     for index, (plane, row, col) in enumerate(np.ndindex(grid)):
-        top, left = row * height, col * width
+        top = row * height
+        left = col * width
         # a tile is stored whole, the last strip only as far as the image goes
         stored_rows = height if page.is_tiled else min(height, rows - top)
         lines = _lines(page, index, stored_rows, width * in_segment)
@@ -82,12 +86,14 @@ def _dtype(page: tifffile.TiffPage, name: str) -> np.dtype[Any]:
 
 def _refuse_coding(page: tifffile.TiffPage, name: str) -> None:
     """Raise FrameError for a compression, predictor or bit order that cannot be undone."""
-    code, remedy = int(page.compression), "Save it without compression, or with LZW or deflate."
+    code = int(page.compression)
+    remedy = "Save it without compression, or with LZW or deflate."
     if code in _LOSSY or (code == _JPEG and page.photometric not in _OF_RAW):
         raise FrameError(f"{name} is compressed by {_codec(code)}, which changes the counts", remedy)
     if code not in (_NONE, *_PREDICTED, *_OF_LIBTIFF) or (code in _OF_LIBTIFF and not features.check("libtiff")):
         raise FrameError(f"{name} is compressed by {_codec(code)}, and its decoder is missing here", remedy)
-    predictor, whole = int(page.predictor), page.bitspersample in (8, 16, 32, 64)
+    predictor = int(page.predictor)
+    whole = page.bitspersample in (8, 16, 32, 64)
     fitting = predictor == 1 or (predictor == 2 and whole) or (predictor == 3 and page.sampleformat == 3)
     if not fitting or (predictor != 1 and code not in _PREDICTED):
         raise FrameError(
@@ -111,7 +117,8 @@ def _require_size(page: tifffile.TiffPage, grid: tuple[int, int, int], segment: 
 
     Decoding such a file would take minutes and all memory.
     """
-    segments, stored = int(np.prod(grid)), sum(page.databytecounts)
+    segments = int(np.prod(grid))
+    stored = sum(page.databytecounts)
     if segments < 1 or segment < 1 or min(len(page.dataoffsets), len(page.databytecounts)) < segments:
         raise ValueError(f"{segments} strips or tiles are needed, and {len(page.dataoffsets)} are listed")
     claimed = segments * segment * int(page.bitspersample) // 8
@@ -121,7 +128,8 @@ def _require_size(page: tifffile.TiffPage, grid: tuple[int, int, int], segment: 
 
 def _lines(page: tifffile.TiffPage, index: int, rows: int, samples: int) -> NDArray[np.uint8]:
     """Return the decompressed bytes of a segment, (rows, bytes of a row); ValueError if some are missing."""
-    file, bits = page.parent.filehandle, int(page.bitspersample)
+    file = page.parent.filehandle
+    bits = int(page.bitspersample)
     file.seek(page.dataoffsets[index])
     data = file.read(page.databytecounts[index])
     if len(data) < page.databytecounts[index]:

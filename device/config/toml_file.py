@@ -120,7 +120,9 @@ def line_of(text: str, keys: list[str]) -> int | None:
 
     `keys` are the names of the tables and of the key; the third of several [[tables]] is `tables.2`.
     """
-    table, found, times = "", None, Counter[str]()
+    table = ""
+    found = None
+    times = Counter[str]()
     for number, line in enumerate(text.splitlines(), 1):
         if header := re.match(r"\s*(\[+)\s*([^\]]+?)\s*\]+", line):
             table = header[2] if header[1] == "[" else f"{header[2]}.{times[header[2]]}"

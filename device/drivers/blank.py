@@ -24,10 +24,11 @@ from contextlib import suppress
 SPEED_HZ = 4_000_000
 WR_MODE, WR_MAX_SPEED_HZ = 0x40016B01, 0x40046B04  # <linux/spi/spidev.h>: _IOW('k', 1, u8), _IOW('k', 4, u32)
 LEDS = 64
-MOST_SINKS = 4  # a shorter chain of TLC5971 shifts the packets of absent chips out
-TRIES, AGAIN_S = 200, 0.05
+MAX_SINKS = 4  # a shorter chain of TLC5971 shifts the packets of absent chips out
+TRIES = 200
+AGAIN_S = 0.05
 MCL_CURRENT = 1  # <sys/mman.h>
-LEAST_NICE = -20
+MIN_NICE = -20
 PIDFD_THREAD = os.O_EXCL  # <linux/pidfd.h>
 
 
@@ -43,7 +44,8 @@ def dark_packets(chips: int) -> bytes:
 
 def off_frames(chip: str, leds: int) -> list[bytes]:
     """Return the messages that turn a chain off, each twice; for the chip "any" those of both kinds."""
-    sinks, matrix = [dark_packets(MOST_SINKS)] * 2, [dark_frame(leds)] * 2
+    sinks = [dark_packets(MAX_SINKS)] * 2
+    matrix = [dark_frame(leds)] * 2
     return {"apa102": matrix, "tlc5971": sinks, "any": sinks + matrix}[chip]
 
 
@@ -79,7 +81,7 @@ def prioritise() -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except OSError:
         with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, 0, LEAST_NICE)
+            os.setpriority(os.PRIO_PROCESS, 0, MIN_NICE)
     with suppress(ImportError, OSError, MemoryError):  # a sandbox may forbid what ctypes needs
         import ctypes
 

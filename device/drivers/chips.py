@@ -12,8 +12,10 @@ from device.errors import BusFault, MemoryDamaged
 from device.values import BatteryState, HeadIdentity
 
 TMP117_PER_C = 128
-MAX17048_VOLTS, MAX17048_SHARE = 78.125e-6, 1 / 25600
-PAGE, WRITING_S = 32, 0.005  # a 24LC32 takes 32 bytes at a time and needs 5 ms to store them
+MAX17048_VOLTS = 78.125e-6
+MAX17048_SHARE = 1 / 25600
+PAGE = 32  # a 24LC32 takes 32 bytes at a time and needs 5 ms to store them
+WRITING_S = 0.005
 MAGIC = b"DSC1"
 Read = TypeVar("Read")
 
@@ -98,7 +100,8 @@ class Eeprom24:
             raise MemoryDamaged("the head's memory holds something else than an identity")
         size = int.from_bytes(head[len(MAGIC) :], "big")
         body = self._bus.read(self._address, len(head), min(size, 1024) + 4)
-        text, sum_ = body[:-4], body[-4:]
+        text = body[:-4]
+        sum_ = body[-4:]
         if zlib.crc32(text) != int.from_bytes(sum_, "big"):
             raise MemoryDamaged("the head's memory is damaged: its checksum does not fit")
         return HeadIdentity(**json.loads(text))

@@ -34,7 +34,9 @@ class RetryingCamera(ABC):
     def __init__(self, spec: CameraSpec, light: LampState, simulated: bool) -> None:
         self._spec, self._light, self._simulated = spec, light, simulated
         self._name = spec.sensor or spec.device
-        self._number, self._closed, self._opened = 0, False, False
+        self._number = 0
+        self._closed = False
+        self._opened = False
         self._ready_s = 0.0  # the exposure time that the sensor uses now
 
     @property
@@ -66,7 +68,8 @@ class RetryingCamera(ABC):
         except TimeoutError:
             self._retry_once(shot, counts, before)
         after = self._light.illumination
-        self._number, self._ready_s = self._number + 1, shot.exposure_s
+        self._number = self._number + 1
+        self._ready_s = shot.exposure_s
         return Frame(counts, shot.exposure_s, self._number, before if before == after else None, self._simulated)
 
     def prepare(self, shot: ExposureSettings) -> None:

@@ -26,7 +26,8 @@ class Heartbeat:
     """Heartbeat in a thread: toggles a line every 0.1 s from `start` to `stop`, and never for longer than the lease."""
 
     def __init__(self, line: Line) -> None:
-        self._line, self._high = line, False
+        self._line = line
+        self._high = False
         self._stopped = Event()
         self._thread: Thread | None = None
         line.set(False)

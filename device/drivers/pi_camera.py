@@ -86,7 +86,8 @@ class PiCamera(RetryingCamera):
 
     def _start(self, exposure_s: float) -> None:
         device = self._device = self._library(self._camera_index(), allocator=self._allocator)
-        spec, size = self._spec, (self._spec.cols, self._spec.rows)
+        spec = self._spec
+        size = (self._spec.cols, self._spec.rows)
         mosaic = self._mosaic = self._reported_mosaic(int(device.camera_properties.get("ColorFilterArrangement", 5)))
         self._refuse_unexpected_mosaic(mosaic)
         asked = device.create_video_configuration(
@@ -144,7 +145,9 @@ class PiCamera(RetryingCamera):
 
     def _granted_layout(self, configuration: dict[str, Any]) -> RawLayout:
         """Return the granted layout, read back as libcamera may adjust a request; CameraMismatch, CameraPacked."""
-        raw, sensor, spec = configuration["raw"], configuration.get("sensor") or {}, self._spec
+        raw = configuration["raw"]
+        sensor = configuration.get("sensor") or {}
+        spec = self._spec
         layout = pi_layout(raw["format"], spec.rows, spec.cols, spec.bit_depth)
         if tuple(raw["size"]) != (spec.cols, spec.rows):
             raise CameraMismatch(
@@ -208,7 +211,8 @@ class PiCamera(RetryingCamera):
         levels = metadata.get("SensorBlackLevels")
         if not levels:
             return
-        nominal_dn, ours_dn = black_dn(levels[0], self._spec.bit_depth), self._spec.black_dn
+        nominal_dn = black_dn(levels[0], self._spec.bit_depth)
+        ours_dn = self._spec.black_dn
         if abs(nominal_dn - ours_dn) > max(nominal_dn, ours_dn) / 2:
             raise CameraMismatch(
                 f"the {self._spec.sensor} says its black level is {nominal_dn:g} DN at {self._spec.bit_depth} bits; "
@@ -218,7 +222,8 @@ class PiCamera(RetryingCamera):
 
     def _close_device(self) -> None:
         """Stop and close the device; CameraStalled after 10 s, because the driver or libcamera may hang."""
-        device, self._device = self._device, None
+        device = self._device
+        self._device = None
         if device is None:
             return
         device.cancel_all_and_flush()

@@ -98,7 +98,8 @@ class _LitCamera:
         return first if first.ok else self._measured(light, colour)
 
     def _measured(self, light: GuardedLight, colour: Colour) -> ProbeFinding:
-        glow, shot = light.hazard.brightest(colour), ExposureSettings(self.exposure_s)
+        glow = light.hazard.brightest(colour)
+        shot = ExposureSettings(self.exposure_s)
         dark = self.camera.expose(shot).counts.astype(np.float64)
         begin_s = self.clock.now_s()
         with light.on(glow):
@@ -115,7 +116,8 @@ def _leds(
     spec: InstrumentSpec, open_parts: OpenParts, camera: _LitCamera, light: GuardedLight, ledger: Ledger
 ) -> Iterator[ProbeFinding]:
     """Yield one finding per LED of the ring; a lamp without separate LEDs is checked as a whole."""
-    chain, colour = chain_of(spec), spec.light.preview_colour
+    chain = chain_of(spec)
+    colour = spec.light.preview_colour
     if chain is None:
         yield _check_part("ring", lambda: camera.finding(light, colour))
         return

@@ -51,7 +51,8 @@ def lit_packets(sinks: SinkSpec, glow: Illumination) -> bytes:
     """
     if glow.colour not in sinks.colours:
         raise LightFault(f"this ring has no {glow.colour} LEDs", "Correct light.colour in the head file.")
-    leds, greys = sinks.colours[glow.colour], [0] * (OUTPUTS * sinks.chips)
+    leds = sinks.colours[glow.colour]
+    greys = [0] * (OUTPUTS * sinks.chips)
     for outputs, trim in zip(leds.outputs, leds.trims or (1.0,) * len(leds.outputs), strict=True):
         for output in outputs:
             greys[output] = max(1, round(GREY_MAX * glow.level * trim))
@@ -141,7 +142,8 @@ class Apa102Ring(LedRing):
     """Ring of a matrix of APA102 LEDs: for benches and model eyes, its light is too weak for an eye (OPTICS.md 4.6)."""
 
     def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
-        self._chain, self._leds = chain, ring(chain)
+        self._chain = chain
+        self._leds = ring(chain)
         super().__init__(chain.device, dark_frame(chain.rows * chain.cols), guardian, lease_s, pulse)
 
     def _lit(self, glow: Illumination) -> bytes:

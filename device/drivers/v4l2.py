@@ -7,7 +7,8 @@ import os
 import select
 from typing import Any, Protocol
 
-U32, S32 = ctypes.c_uint32, ctypes.c_int32
+U32 = ctypes.c_uint32
+S32 = ctypes.c_int32
 CAPTURE, MMAP, ANY_FIELD = 1, 1, 0
 CAN_CAPTURE, CAN_STREAM = 0x1, 0x04000000
 FRAME_BROKEN, STAMP_MONOTONIC, STAMP_AT_START = 0x40, 0x2000, 0x10000
@@ -89,11 +90,16 @@ def _code(direction: int, number: int, struct: type[ctypes.Structure]) -> int:
     return direction << 30 | ctypes.sizeof(struct) << 16 | ord("V") << 8 | number
 
 
-QUERYCAP, S_FMT = _code(2, 0, Capability), _code(3, 5, Format)
-REQBUFS, QUERYBUF = _code(3, 8, Buffers), _code(3, 9, Buffer)
-QBUF, DQBUF = _code(3, 15, Buffer), _code(3, 17, Buffer)
-STREAMON, STREAMOFF = _code(1, 18, Integer), _code(1, 19, Integer)
-G_CTRL, S_CTRL = _code(3, 27, Control), _code(3, 28, Control)
+QUERYCAP = _code(2, 0, Capability)
+S_FMT = _code(3, 5, Format)
+REQBUFS = _code(3, 8, Buffers)
+QUERYBUF = _code(3, 9, Buffer)
+QBUF = _code(3, 15, Buffer)
+DQBUF = _code(3, 17, Buffer)
+STREAMON = _code(1, 18, Integer)
+STREAMOFF = _code(1, 19, Integer)
+G_CTRL = _code(3, 27, Control)
+S_CTRL = _code(3, 28, Control)
 
 
 class Transport(Protocol):

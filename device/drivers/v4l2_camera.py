@@ -20,7 +20,7 @@ from device.values import Counts, ExposureSettings
 
 BUFFERS = 4
 DELAY = 2  # frames after a change of exposure time that may still have the previous one
-MOST_FRAMES = 16
+MAX_FRAMES = 16
 FRAME_TIMEOUT_S = 2.0
 NO_CAMERA_REMEDY = "Plug the camera in, or name another device in the head's file; see `ls /dev/video*`."
 
@@ -44,7 +44,9 @@ class V4l2Camera(RetryingCamera):
         transport: v4l2.Transport | None = None,
     ) -> None:
         super().__init__(spec, light, simulated)
-        self._clock, self._patience_s, self._kernel = clock, patience_s, transport or v4l2.KernelTransport()
+        self._clock = clock
+        self._patience_s = patience_s
+        self._kernel = transport or v4l2.KernelTransport()
         self._fd: int | None = None
         self._memory: list[Any] = []
         self._stride = self._exposure_100us = 0
@@ -83,7 +85,8 @@ class V4l2Camera(RetryingCamera):
 
     def _granted_layout(self) -> RawLayout:
         """Return the layout of the first format granted with the sensor's bits or 16; CameraMismatch, CameraPacked."""
-        spec, granted = self._spec, v4l2.Format()
+        spec = self._spec
+        granted = v4l2.Format()
         deep = sorted((bits, name) for name, bits in V4L2_BITS.items() if bits in (spec.bit_depth, 16))
         for _, name in deep:
             granted = v4l2.Format(
@@ -120,7 +123,7 @@ class V4l2Camera(RetryingCamera):
         begin_s = self._clock.now_s()
         try:
             late = DELAY if self._set_exposure(shot) else 0
-            for _ in range(MOST_FRAMES):
+            for _ in range(MAX_FRAMES):
                 if not self._kernel.wait(self._handle, shot.exposure_s + self._patience_s):
                     raise TimeoutError
                 buffer = self._buffer(0)
@@ -139,7 +142,7 @@ class V4l2Camera(RetryingCamera):
             if error.errno == errno.EIO:  # a frame was lost on the bus, and later ones may be lost too
                 raise TimeoutError from error
             raise CameraMissing(f"{self._name} has gone: {error.strerror}", NO_CAMERA_REMEDY) from error
-        raise CameraStalled(f"{MOST_FRAMES} frames passed, all of them broken or too old")
+        raise CameraStalled(f"{MAX_FRAMES} frames passed, all of them broken or too old")
 
     def _began_s(self, buffer: v4l2.Buffer, shot: ExposureSettings) -> float:
         """Return the clock time, s, of the exposure's start; the timestamp is its end unless flags mark its start."""
@@ -157,8 +160,10 @@ class V4l2Camera(RetryingCamera):
             self._layout.counts(rows, counts)
 
     def _close_device(self) -> None:
-        fd, self._fd = self._fd, None
-        memory, self._memory = self._memory, []
+        fd = self._fd
+        self._fd = None
+        memory = self._memory
+        self._memory = []
         for part in memory:
             part.close()
         if fd is not None:

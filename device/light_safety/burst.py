@@ -42,14 +42,16 @@ def burst(
     frames: list[Frame] = []
     with light.on(illumination, eyes, in_visit=in_visit):
         begin_s = last_s = clock.now_s()
-        longest_s, most_s = 0.0, light.max_on_s
+        longest_s = 0.0
+        most_s = light.max_on_s
         while len(frames) < count * parts and (not frames or last_s + longest_s - begin_s < most_s):
             frame = camera.expose(shot)
             if frames and frame.illumination is None:
                 break
             frames.append(require_lit(frame))
             taken(frame)
-            longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
+            longest_s = max(longest_s, clock.now_s() - last_s)
+            last_s = clock.now_s()
             if parts > 1 and len(frames) == 1:
                 most_s = min(most_s, count * _whole_s(shot.exposure_s, longest_s, parts, whole_s) + ROUNDING_S)
     return tuple(frames)

@@ -118,7 +118,8 @@ def limit_error(eye: Eye, spent_j_per_cm2: float, stop_j_per_cm2: float, wait_s:
             f"one exposure would be more than the {stop_j_per_cm2:.3g} J/cm2 that {name} may have in a day",
             "Choose a dimmer light or another colour.",
         )
-    now, minutes = wall.astimezone(), ceil(wait_s / 60)
+    now = wall.astimezone()
+    minutes = ceil(wait_s / 60)
     then = now + timedelta(minutes=minutes)
     when = f"{then:%H:%M}" if then.date() == now.date() else f"{then:%H:%M on %Y-%m-%d}"
     kind = DailyLightLimit if wait_s > LONGEST_REST_S else LightLimit
@@ -135,7 +136,10 @@ class MemoryLedger:
     def __init__(
         self, clock: Clock, window_s: float = 86400.0, page: DoseLedgerState | None = None, boot: str = "this"
     ) -> None:
-        self._clock, self._window_s, self._boot, self.state = clock, window_s, boot, page or DoseLedgerState()
+        self._clock = clock
+        self._window_s = window_s
+        self._boot = boot
+        self.state = page or DoseLedgerState()
         self._advanced()
 
     def spent_j_per_cm2(self, eye: Eye) -> float:

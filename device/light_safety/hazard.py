@@ -26,7 +26,7 @@ from device.optics.matrix import Lamp
 from device.values import Colour, Illumination
 
 LIMITS = Path(__file__).with_name("limits.toml")
-MOST_UNCHECKED_SHARE = 0.5  # of a limit that was not compared with the purchased standard
+MAX_UNCHECKED_SHARE = 0.5  # of a limit that was not compared with the purchased standard
 LEVELS = 1000  # steps of the level: a colour that is too bright at the lowest one has no permitted level
 LED_POWER_UNCERTAINTY = 2.0  # uncertainty factor of the LEDs' power (device/optics/illumination.py)
 
@@ -58,8 +58,8 @@ class _Rate(_Source):
 
     @model_validator(mode="after")
     def _uses_half_of_what_is_unchecked(self) -> Self:
-        if not self.checked and self.share > MOST_UNCHECKED_SHARE:
-            raise ValueError(f"the share of an unchecked limit is at most {MOST_UNCHECKED_SHARE}")
+        if not self.checked and self.share > MAX_UNCHECKED_SHARE:
+            raise ValueError(f"the share of an unchecked limit is at most {MAX_UNCHECKED_SHARE}")
         return self
 
 

@@ -142,7 +142,9 @@ def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
     """Return a head's design, with ring and pupil of `path` if the head names none; SpecError without [optics]."""
     if spec.optics is None:
         raise SpecError(f"{spec.name}: no table [optics], so nothing is known of its light path")
-    chain, camera, pupil_mm = geometry_of(spec) or path.ring, spec.camera, spec.light.pupil_mm or path.eye.pupil_mm
+    chain = geometry_of(spec) or path.ring
+    camera = spec.camera
+    pupil_mm = spec.light.pupil_mm or path.eye.pupil_mm
     colour = spec.light.colour
     lamp = (lamps_of(spec) or {}).get(colour) or Lamp(LED[colour], len(ring(chain)))
     found = Design(
@@ -203,8 +205,11 @@ def design_of_sensor(path: LightPath, sensor: SensorProfile) -> Design:
 
 def optical_budget(design: Design) -> OpticalBudget:
     """Return all numbers of a design, by the formulas in `eye.py`, `matrix.py` and `illumination.py`."""
-    relay, field, pitch_um = design.relay, design.optics.field_deg, design.pitch_um
-    whole, inside = _whole_light(design), design.share_in_pupil
+    relay = design.relay
+    field = design.optics.field_deg
+    pitch_um = design.pitch_um
+    whole = _whole_light(design)
+    inside = design.share_in_pupil
     light = PhotonBudget(
         whole.cornea_mw, inside * whole.retina_mw_per_cm2, inside * whole.image_nw, inside * whole.electrons_per_px_s
     )

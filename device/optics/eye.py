@@ -141,7 +141,9 @@ def iris_overlap(shift_mm: float, beam_mm: float, iris_mm: float) -> float:
 
     `beam_mm` and `iris_mm` are radii; OPTICS.md 1.4, V.
     """
-    x, big, r = abs(shift_mm), beam_mm, iris_mm
+    x = abs(shift_mm)
+    big = beam_mm
+    r = iris_mm
     if x <= big - r:
         return 1.0
     if x >= big + r:

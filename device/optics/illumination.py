@@ -90,7 +90,8 @@ def photon_budget(
     `half_cone` None: the cone that lights the field, degrees. The image's width is d + 2 s, iris plus twice the shift
     of the field's edge, because the diffuser spreads every point over the iris's shadow.
     """
-    relay, led = relay or Relay(), led or LED[colour]
+    relay = relay or Relay()
+    led = led or LED[colour]
     half_cone = half_cone or half_cone_deg(field_deg, relay.angular_magnification)
     cornea_mw = leds * led.power_mw * sin(radians(half_cone)) ** 2 * TRANSMISSION_TO_EYE
     lit_cm2 = pi * (eye_mm / 10 * tan(radians(field_deg / 2))) ** 2

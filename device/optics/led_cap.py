@@ -35,7 +35,8 @@ def seen_share(cap: LedCap, right: ArrayLike, up: ArrayLike) -> Floats:
 
     The shape is that of the slopes together. Rows and columns of the die are those of the LED board.
     """
-    half, radius = cap.emitter_mm / 2, cap.hole_mm / 2
+    half = cap.emitter_mm / 2
+    radius = cap.hole_mm / 2
     middle_x, middle_y = (cap.height_mm * np.asarray(slope, np.float64)[..., None] for slope in (right, up))
     strips = half * ((2 * np.arange(_STRIPS) + 1) / _STRIPS - 1)
     chord = np.sqrt(np.maximum(radius**2 - (strips + middle_y) ** 2, 0.0))

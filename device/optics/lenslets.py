@@ -42,7 +42,8 @@ def path_um(element: DiffuserSpec, distance_um: float, iris_um: float, x_um: Pla
     o(r) = (n - 1) h(r) = -min_i |r - c_i|^2 / (2 f): float32 (samples, samples), zero at each centre, negative beside
     it. Outside of the iris the lenses end, and the path is that of their farthest place.
     """
-    reach, focal = reach_um(element), focal_um(element, distance_um)
+    reach = reach_um(element)
+    focal = focal_um(element, distance_um)
     nearest = np.full((x_um.size, x_um.size), reach**2, np.float32)
     for right_um, down_um in centres_um(element, iris_um, seed):
         rows, cols = (slice(*np.searchsorted(x_um, (at - reach, at + reach))) for at in (down_um, right_um))
@@ -57,7 +58,8 @@ def centres_um(element: DiffuserSpec, iris_um: float, seed: int) -> Places:
     An array has a lens on the axis. Lenslets are a random packing: candidates in random order, each taken that is
     at least CLOSEST pitches from all before; it is filled, so no place of the iris is farther from a centre.
     """
-    pitch, half = element.pitch_um, iris_um / 2 + element.pitch_um
+    pitch = element.pitch_um
+    half = iris_um / 2 + element.pitch_um
     if element.kind == "microlenses":
         along = np.arange(-math.ceil(half / pitch), math.ceil(half / pitch) + 1) * pitch
         return _pairs(along)

@@ -57,7 +57,8 @@ class LightPath(Table):
     @model_validator(mode="after")
     def _one_magnification(self) -> "LightPath":
         """Raise ValueError if the magnification is not first_mm / second_mm, or the splitter not behind the lenses."""
-        stated, lenses = self.optics.angular_magnification, self.relay.first_mm / self.relay.second_mm
+        stated = self.optics.angular_magnification
+        lenses = self.relay.first_mm / self.relay.second_mm
         if not isclose(stated, lenses, rel_tol=1e-6):
             raise ValueError(f"optics.angular_magnification = {stated:g}, but the relay's lenses give {lenses:g}")
         if self.relay.splitter_to_iris_mm >= self.relay.second_mm:
@@ -82,7 +83,8 @@ def relay_of(path: LightPath, optics: OpticsSpec) -> Relay:
 
 def led_cap(path: LightPath, optics: OpticsSpec, emitter_mm: float) -> LedCap:
     """Return the hole before an LED with a die of that width, as long as makes the cone of the head's field."""
-    hole_mm, half_deg = path.cap.hole_mm, relay_of(path, optics).led_cone_deg(optics.field_deg) / 2
+    hole_mm = path.cap.hole_mm
+    half_deg = relay_of(path, optics).led_cone_deg(optics.field_deg) / 2
     return LedCap(hole_mm, cap_height_mm(hole_mm, half_deg), emitter_mm)
 
 
@@ -99,11 +101,14 @@ def ray_mm(relay: Relay, eye_mm: float, height_mm: float, angle_deg: float) -> l
     The points are on retina, pupil (0, `height_mm`), both ideal thin lenses, iris and sensor. The ray leaves the pupil
     at `angle_deg` to the axis.
     """
-    slope, planes = tan(radians(angle_deg)), planes_mm(relay)
-    at, places = 0.0, [(-eye_mm, -eye_mm * slope), (0.0, height_mm)]
+    slope = tan(radians(angle_deg))
+    planes = planes_mm(relay)
+    at = 0.0
+    places = [(-eye_mm, -eye_mm * slope), (0.0, height_mm)]
     for plane, focal_mm in zip(planes, (relay.first_mm, relay.second_mm, inf, inf), strict=True):
         height_mm += slope * (plane - at)
-        slope, at = slope - height_mm / focal_mm, plane
+        slope = slope - height_mm / focal_mm
+        at = plane
         places.append((plane, height_mm))
     return places
 
@@ -115,7 +120,8 @@ def led_ray_mm(path: LightPath, relay: Relay, led_mm: float, angle_deg: float) -
     iris is behind the splitter, which mirrors one into the other.
     """
     first, second, iris, _ = planes_mm(relay)
-    plate, slope = iris - path.relay.splitter_to_iris_mm, tan(radians(angle_deg))
+    plate = iris - path.relay.splitter_to_iris_mm
+    slope = tan(radians(angle_deg))
     along = (iris - plate - led_mm) / (1 - slope)  # from the iris to the plate, where height = place - plate
     met = (iris - along, led_mm - slope * along)
     at_second = led_mm - slope * relay.second_mm

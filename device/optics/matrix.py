@@ -41,7 +41,8 @@ def ring(chain: ChainSpec) -> tuple[int, ...]:
     """
     if chain.leds is not None:
         return chain.leds
-    radius, slack = chain.ring_mm / 2, chain.tolerance_mm / 2
+    radius = chain.ring_mm / 2
+    slack = chain.tolerance_mm / 2
     found = tuple(i for i, place in enumerate(led_positions_mm(chain)) if abs(hypot(*place) - radius) <= slack)
     if not found:
         near = min(led_positions_mm(chain), key=lambda place: abs(hypot(*place) - radius))
@@ -88,7 +89,8 @@ def ring_for_pupil(chain: ChainSpec, pupil_mm: float, magnification: float) -> C
 
 def chain_of(spec: InstrumentSpec) -> ChainSpec | None:
     """Return the LED matrix of a head file, with `light.pupil_mm` that of the ring that fits; None without a matrix."""
-    chain, light = spec.light.chain, spec.light
+    chain = spec.light.chain
+    light = spec.light
     if chain is None or light.pupil_mm is None or spec.optics is None:
         return chain
     return ring_for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)

@@ -73,7 +73,8 @@ def paths(surfaces: Sequence[Surface], beam: Rays, index_before: float = 1.0) ->
         after = trace([surface], beam, index_before)
         if len(after.numbers) < len(beam.numbers):
             raise SpecError(f"a ray is blocked at {surface.name}", "Draw surfaces without clear apertures.")
-        beam, index_before = after, surface.index_behind
+        beam = after
+        index_before = surface.index_behind
         points.append(beam.points_mm)
     return np.array(points)
 
@@ -86,7 +87,8 @@ def at_plane(beam: Rays, at_mm: float) -> Points:
 
 def _meet(surface: Surface, beam: Rays) -> tuple[Rays, Points]:
     """Return the rays where they meet a surface, within its clear aperture, and the unit normals along the light."""
-    points, towards = beam.points_mm, beam.directions
+    points = beam.points_mm
+    towards = beam.directions
     if isinf(surface.radius_mm):
         turn = radians(surface.tilt_deg)
         normals = np.broadcast_to([sin(turn), 0.0, cos(turn)], points.shape)
@@ -157,12 +159,14 @@ def paraxial(surfaces: Sequence[Surface], index_before: float = 1.0) -> Paraxial
 
     SpecError for a system without power.
     """
-    matrix, at_mm = np.eye(2), surfaces[0].at_mm
+    matrix = np.eye(2)
+    at_mm = surfaces[0].at_mm
     for one in surfaces:
         matrix = np.array([[1, one.at_mm - at_mm], [0, 1]]) @ matrix
         ratio = index_before / one.index_behind
         matrix = np.array([[1, 0], [(ratio - 1) / one.radius_mm, ratio]]) @ matrix
-        index_before, at_mm = one.index_behind, one.at_mm
+        index_before = one.index_behind
+        at_mm = one.at_mm
     (a, _), (c, d) = matrix
     if abs(c) < 1e-12:
         raise SpecError("these surfaces have no focus", "Give a lens with a power other than zero.")

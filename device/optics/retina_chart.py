@@ -45,7 +45,8 @@ class BarGroup:
 
     def signed_distance_um(self, x_um: Image, y_um: Image) -> Image:
         """Return the signed distance to the nearest bar, um, negative inside."""
-        across, along = x_um - np.float32(self.right_um), y_um - np.float32(self.down_um)
+        across = x_um - np.float32(self.right_um)
+        along = y_um - np.float32(self.down_um)
         if not self.upright:
             across, along = along, across
         number = np.clip(np.rint(across / np.float32(self.period_um)), -(BARS // 2), BARS // 2)
@@ -54,7 +55,8 @@ class BarGroup:
 
     def bars_um(self) -> list[tuple[float, float, float, float]]:
         """Return left, top, width and height of each bar."""
-        wide, half = self.period_um / 2, self.side_um / 2
+        wide = self.period_um / 2
+        half = self.side_um / 2
         found = []
         for number in range(-(BARS // 2), BARS // 2 + 1):
             begin = number * self.period_um - wide / 2
@@ -116,7 +118,8 @@ MARKS = tuple(
     for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1))
 )
 RINGS = tuple(Ring(angle_deg) for angle_deg in RINGS_DEG)
-GREY_PATCH, INK_PATCH = Disc(2600, -4000, 1800, GREY), Disc(-2800, -4100, 1400)
+GREY_PATCH = Disc(2600, -4000, 1800, GREY)
+INK_PATCH = Disc(-2800, -4100, 1400)
 PAPER_PATCH = Disc(-2800, 4100, 1000, 1.0)  # a place without ink
 ELEMENTS: tuple[Element, ...] = (*BAR_GROUPS, *MARKS, *RINGS, GREY_PATCH, INK_PATCH)
 

@@ -77,7 +77,8 @@ class TracedRelay:
 
     def _at_iris(self, heights_mm: np.ndarray, angle_deg: float, azimuth_deg: float, blocked: bool) -> Points:
         """Return (x, y) in the iris plane of parallel rays through points of the pupil; `blocked`: by lens rims."""
-        turn, out = radians(azimuth_deg), radians(angle_deg)
+        turn = radians(azimuth_deg)
+        out = radians(angle_deg)
         direction = np.array([sin(out) * cos(turn), sin(out) * sin(turn), cos(out)])
         off = np.array([cos(turn), sin(turn)]) * self.deviation.pupil_lateral_mm
         starts = np.column_stack([heights_mm + off, np.full(len(heights_mm), -self.deviation.pupil_axial_mm)])
@@ -152,7 +153,8 @@ def traced_relay(
     first, second = (
         _scaled(pair, scale) for pair, scale in zip(pairs, (deviation.first_scale, deviation.second_scale), strict=True)
     )
-    one, two = paraxial(pairs[0]), paraxial(pairs[1])  # the tube is made for the nominal lenses
+    one = paraxial(pairs[0])  # the tube is made for the nominal lenses
+    two = paraxial(pairs[1])
     first = moved(first, one.front_mm)
     apart = pairs[0][-1].at_mm + one.front_mm + one.back_mm + two.front_mm + deviation.separation_mm
     second = moved(second, apart)
@@ -221,15 +223,18 @@ def without_rims(surfaces: Sequence[Surface]) -> tuple[Surface, ...]:
 def _disc(count: int, radius_mm: float) -> np.ndarray:
     """Return points that fill a disc evenly, with their mean in its middle, (count, 2), mm; `count` is even."""
     k = np.arange(count // 2)
-    reach, turn = radius_mm * np.sqrt((k + 0.5) / (count // 2)), SPIRAL * k
+    reach = radius_mm * np.sqrt((k + 0.5) / (count // 2))
+    turn = SPIRAL * k
     half = np.column_stack([reach * np.cos(turn), reach * np.sin(turn)])
     return np.concatenate([half, -half])
 
 
 def _inside(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """Return for each point whether it lies inside a closed outline (even-odd rule), bool (points,)."""
-    x, y = points[:, :1], points[:, 1:]
-    (x1, y1), (x2, y2) = outline.T, np.roll(outline, -1, axis=0).T
+    x = points[:, :1]
+    y = points[:, 1:]
+    (x1, y1) = outline.T
+    (x2, y2) = np.roll(outline, -1, axis=0).T
     crossing = (y1 > y) != (y2 > y)
     with np.errstate(divide="ignore", invalid="ignore"):
         right = x < x1 + (y - y1) * (x2 - x1) / (y2 - y1)
@@ -265,9 +270,11 @@ def retina_point(
     )
     at_mm = lens[-1].at_mm + (eye_to_screen_mm or paraxial(lens).back_mm)
     retina = Surface(at_mm, -(retina_radius_mm or path.layout.retina_radius_mm), 1.0, name="the retina")
-    inward, out = without_rims((*lens, retina)), radians(angle_deg)
+    inward = without_rims((*lens, retina))
+    out = radians(angle_deg)
     chief = trace(inward, rays(np.zeros((1, 3)), np.array([0, sin(out), cos(out)])))
-    point, towards = chief.points_mm[0], -chief.directions[0]
+    point = chief.points_mm[0]
+    towards = -chief.directions[0]
     across = np.array([1.0, 0, 0])
     along = np.cross(across, towards)
     fan = np.array([towards + step * side for side in (across, along) for step in (-CLOSE_RAD, CLOSE_RAD)])
@@ -285,7 +292,8 @@ def retina_point(
 def built_relays(path: LightPath, count: int, seed: int) -> Iterator[TracedRelay]:
     """Yield relays with random deviations, uniform within TOLERANCES, for a Monte Carlo study; repeatable by `seed`."""
     rng = np.random.default_rng(seed)
-    names, reach = list(TOLERANCES), np.array(list(TOLERANCES.values()))
+    names = list(TOLERANCES)
+    reach = np.array(list(TOLERANCES.values()))
     for _ in range(count):
         drawn = dict(zip(names, (rng.uniform(-1, 1, len(reach)) * reach).tolist(), strict=True))
         scales = {name: 1 + drawn[name] for name in ("first_scale", "second_scale")}
@@ -316,6 +324,7 @@ def f_theta_error(relay: TracedRelay, angle_deg: float) -> tuple[float, float]:
     (`displacement_error`). Linear: angle behind = a angle. Tangent: tan(angle behind) = a tan(angle), with a of angles
     near the axis.
     """
-    near, far = relay.angle_behind_deg(NEAR_DEG) / NEAR_DEG, relay.angle_behind_deg(angle_deg)
+    near = relay.angle_behind_deg(NEAR_DEG) / NEAR_DEG
+    far = relay.angle_behind_deg(angle_deg)
     ideal = degrees(atan(near * tan(radians(angle_deg))))
     return far / (near * angle_deg) - 1, far / ideal - 1

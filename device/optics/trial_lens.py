@@ -47,7 +47,8 @@ class TrialLens(NamedTuple):
     @property
     def power(self) -> PowerVector:
         """Power vector of the lens itself."""
-        half_dpt, twice_rad = -self.cylinder_dpt / 2, 2 * radians(self.axis_deg)
+        half_dpt = -self.cylinder_dpt / 2
+        twice_rad = 2 * radians(self.axis_deg)
         return PowerVector(
             self.sphere_dpt + self.cylinder_dpt / 2, half_dpt * cos(twice_rad), half_dpt * sin(twice_rad)
         )
@@ -62,7 +63,8 @@ def correction_behind(lens: TrialLens, vertex_mm: float, eye: PowerVector = EMME
     `vertex_mm` is the distance from the lens to the eye's pupil, `eye` the correction that the eye alone needs there.
     A lens of +5 dpt at 12 mm makes an emmetropic eye myopic: -4.72 dpt.
     """
-    distance_m, one = vertex_mm / 1000, np.eye(2)
+    distance_m = vertex_mm / 1000
+    one = np.eye(2)
     leaving = -eye.matrix
     behind_lens = leaving @ np.linalg.inv(one - distance_m * leaving) + lens.power.matrix
     seen = -behind_lens @ np.linalg.inv(one + distance_m * behind_lens)

@@ -36,9 +36,9 @@ from device.recon.reconstructor import (
 from device.values import Calibration, FrameUse, Image
 
 SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading
-LEAST_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
-MOST_FRAMES = 64
-LEAST_COARSE = 200  # samples of a quick look along its shorter side, to be registered
+MIN_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
+MAX_FRAMES = 64
+MIN_COARSE = 200  # samples of a quick look along its shorter side, to be registered
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class BurstJoiner:
     """Joining of bursts of one calibration and sensor shape with PSF `index`; planned at construction.
 
     With `single`, a reconstructor of this calibration, its quick looks are registered instead of final pictures, where
-    they have at least LEAST_COARSE samples and the field is calibrated: in half the time, with 0.12 instead of 0.09
+    they have at least MIN_COARSE samples and the field is calibrated: in half the time, with 0.12 instead of 0.09
     pixels rms (NUMERICS.md 9.1).
 
     It holds 8 bytes per pixel of each frame, and some arrays of one frame while it joins: 4 frames of 2.07 MP take 160
@@ -91,7 +91,7 @@ class BurstJoiner:
         single: Reconstructor | None = None,
     ) -> None:
         coarse, fine = default_schedule(calibration, shape, index)
-        if min(shape) // coarse.bin < LEAST_COARSE or not isfinite(field_radius_px(calibration)):
+        if min(shape) // coarse.bin < MIN_COARSE or not isfinite(field_radius_px(calibration)):
             single = None
         self._calibration, self._shape = calibration, shape
         self.registers_quick_looks = single is not None
@@ -171,7 +171,8 @@ class BurstJoiner:
         """Return the smooth part of a frame on the sensor, its picture without detail, blurred by the PSF, and its
         scale in DN; `near` is the blurred field.
         """
-        stage, sigma = self._stage, SMOOTH_PX / self._stage.grid.n
+        stage = self._stage
+        sigma = SMOOTH_PX / self._stage.grid.n
         picture = ndimage.gaussian_filter(seen.picture * field, sigma) / near * field
         blurred = to_sensor(stage.model.blur(picture.astype(np.float32)), self._whole)
         along, _, energy, _, _ = kernels.flat_fit_sums(seen.light, blurred, seen.good)  # least squares
@@ -185,14 +186,16 @@ class BurstJoiner:
         near = np.maximum(ndimage.gaussian_filter(field, SMOOTH_PX / self._stage.grid.n), 0.05)
         base, base_scale = self._smooth(reference, field, near)
         detail = np.empty(self._shape, np.float32)
-        joined, weights = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.float32)
+        joined = np.zeros(self._shape, np.float32)
+        weights = np.zeros(self._shape, np.float32)
         for k in used:
-            shift, one = uses[k].shift_px, seen[k]
+            shift = uses[k].shift_px
+            one = seen[k]
             assert shift is not None
             smooth, scale = (base, base_scale) if one is reference else self._smooth(one, field, near)
             kernels.subtract_scaled(one.light, smooth, scale, one.good, detail)
             add_moved_back(detail, one.good, shift, shares[k], reference.mean_dn / one.mean_dn, joined, weights)
-        kernels.finish_mean(joined, weights, LEAST_WEIGHT, base, base_scale)
+        kernels.finish_mean(joined, weights, MIN_WEIGHT, base, base_scale)
         light = total_dn / reference.mean_dn
         frames = tuple(replace(one, weight=shares.get(one.index, 0.0)) for one in uses)
         return JoinedFrame(joined, light, frames)

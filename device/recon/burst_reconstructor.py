@@ -42,10 +42,14 @@ class BurstReconstructor:
     """
 
     def __init__(self, single: Reconstructor, planner: Planner, *, timed: bool = True) -> None:
-        calibration, shape, index = single.calibration, single.shape, single.psf_index
-        self.single, self.clock = single, single.clock
+        calibration = single.calibration
+        shape = single.shape
+        index = single.psf_index
+        self.single = single
+        self.clock = single.clock
         self.joiner = BurstJoiner(calibration, shape, planner, single.clock, index, single)
-        self.see_cost, self.join_cost = DurationEstimate(), DurationEstimate()  # of one frame
+        self.see_cost = DurationEstimate()  # of one frame
+        self.join_cost = DurationEstimate()
         if timed:
             self._warm_up()
 
@@ -53,7 +57,8 @@ class BurstReconstructor:
         """Make a picture of two frames of noise, to compile the kernels and to measure the cost."""
         noise = noise_frame(self.single.calibration, self.single.shape)
         for _ in range(2):  # the first one compiles
-            self.see_cost, self.join_cost = DurationEstimate(), DurationEstimate()
+            self.see_cost = DurationEstimate()
+            self.join_cost = DurationEstimate()
             run = _Run(self, None)
             for step in run.join([noise, noise], np.zeros_like(noise)):
                 assert isinstance(step, RoundDone)
@@ -64,7 +69,8 @@ class BurstReconstructor:
         With `refract` a thread begins to estimate its refraction; a burst needs it of its first used frame only.
         FrameError for a frame without light, or with too many missing pixels.
         """
-        seen, stage = self.joiner.see(counts, dark), self.single.stages[0]
+        seen = self.joiner.see(counts, dark)
+        stage = self.single.stages[0]
         if not self.joiner.registers_quick_looks:
             self.single(counts, dark, quick=True)
         is_last = stage is self.single.stages[-1]
@@ -92,7 +98,8 @@ class BurstReconstructor:
         that of the first. Without `refract` the PSF is that of the picture before. FrameError for another shape, for a
         first frame with too many missing pixels for a quick look, or if no frame can be used.
         """
-        run, ready = _Run(self, deadline, refract), dict(prepared or {})
+        run = _Run(self, deadline, refract)
+        ready = dict(prepared or {})
         tasks = {k: one.refraction for k, one in ready.items()}
         if len(frames) == 1:
             yield from self.single.steps(
@@ -180,9 +187,11 @@ class _Run:
         refraction: RefractionTask | None,
     ) -> Iterator[Step]:
         """Yield the steps of the picture of the joined frames `used`; `saturated` and `refraction` are the first's."""
-        owner, joined = self._owner, self.joined
+        owner = self._owner
+        joined = self.joined
         assert joined is not None
-        total, is_solved = joined.counts * np.float32(joined.light), False
+        total = joined.counts * np.float32(joined.light)
+        is_solved = False
         for step in owner.single.steps(
             used[0],
             dark,

@@ -20,17 +20,18 @@ CHANNELS: tuple[Colour, ...] = ("red", "green", "blue", "amber")
 RGB: tuple[Colour, ...] = ("red", "green", "blue")  # channels of the picture
 FLATTEN_PX = 12.0  # colours differ in their shading: less of it is kept than between frames of one colour
 BAND_PER_PX = (0.01, 0.12)
-GUIDE_PX, GUIDE_EPS = 17, 0.01  # window of the guided filter, and the share of the guide's variance that is noise
+GUIDE_PX = 17  # window of the guided filter, and the share of the guide's variance that is noise
+GUIDE_EPS = 0.01
 GUIDED_SHARE = 0.5  # of the filtered picture; the rest keeps what green does not show
-LEAST_SD = 10.0  # of the correlation: wrong registrations had 9.2 or less, right ones 10 or more (NUMERICS.md 10.1)
-LEAST_CERTAIN = 0.5  # of the correlation itself: in a small picture the surface has too few places for LEAST_SD
+MIN_SD = 10.0  # of the correlation: wrong registrations had 9.2 or less, right ones 10 or more (NUMERICS.md 10.1)
+MIN_CERTAIN = 0.5  # of the correlation itself: in a small picture the surface has too few places for MIN_SD
 
 # Blue over its mean as a linear function of red and green over theirs: offset, red, green. Least squares over the sRGB
 # values of four photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3). They are
 # applied to linear pictures.
 BLUE_FROM_RED_GREEN = (-0.133, 0.274, 0.862)
 BLUE_OVER_GREEN = 0.60  # median of mean blue over mean green, sRGB values, 0.42 to 0.72; linear: white_balance
-MOST_OF_MEAN = 3.0  # of red and green over their means: the photographs reach 1.3 and 3.2
+MAX_OF_MEAN = 3.0  # of red and green over their means: the photographs reach 1.3 and 3.2
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def register_colours(
         found = Registration((0.0, 0.0), 1.0, 0.0)
         if name != reference:
             found = registrar.register(target, registrar.detail(flat))
-        if found.correlation < min(LEAST_SD * found.sd, LEAST_CERTAIN):
+        if found.correlation < min(MIN_SD * found.sd, MIN_CERTAIN):
             doubtful.append(name)
             found = Registration((0.0, 0.0), 0.0, 0.0)
         elif name != reference:
@@ -112,7 +113,8 @@ def guided_filter(picture: Image, guide: Image, field: Image) -> Image:
         return np.asarray(ndimage.uniform_filter(image * inside, GUIDE_PX) / weight, np.float32)
 
     eps = max(GUIDE_EPS * float(guide[inside > 0].var()) if inside.any() else 0.0, 1e-20)  # an even guide has none
-    mean_guide, mean_picture = mean(guide), mean(picture)
+    mean_guide = mean(guide)
+    mean_picture = mean(picture)
     slope = (mean(guide * picture) - mean_guide * mean_picture) / (mean(guide**2) - mean_guide**2 + eps)
     filtered = mean(slope) * guide + mean(mean_picture - slope * mean_guide)
     return np.where(inside > 0, filtered, picture).astype(np.float32)
@@ -126,7 +128,7 @@ def predicted_blue(red: Image, green: Image, field: Image) -> Image:
     """
     inside = field > 0.5
     means = [float(one[inside].mean()) if inside.any() else float(one.mean()) for one in (red, green)]
-    r, g = (np.clip(one / max(mean, 1e-30), 0, MOST_OF_MEAN) for one, mean in zip((red, green), means, strict=True))
+    r, g = (np.clip(one / max(mean, 1e-30), 0, MAX_OF_MEAN) for one, mean in zip((red, green), means, strict=True))
     offset, of_red, of_green = BLUE_FROM_RED_GREEN
     blue = offset + of_red * r + of_green * g
     return np.asarray(np.maximum(blue, 0) * BLUE_OVER_GREEN * means[1] * field, np.float32)

@@ -62,9 +62,12 @@ class ColourReconstructor:
         reference: Colour = "green",
         timed: bool = True,
     ) -> None:
-        calibration, shape = green.calibration, green.shape
+        calibration = green.calibration
+        shape = green.shape
         self._calibration, self._reference = calibration, reference
-        self.others, self.clock, self.join_cost = others, green.clock, DurationEstimate()
+        self.others = others
+        self.clock = green.clock
+        self.join_cost = DurationEstimate()
         self.singles = {
             colour: one.single if isinstance(one, BurstReconstructor) else one for colour, one in others.items()
         }
@@ -74,7 +77,8 @@ class ColourReconstructor:
             if one is not green
         }
         self.box = field_box(calibration, shape)
-        radius_px, middle = field_radius_px(calibration), ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
+        radius_px = field_radius_px(calibration)
+        middle = ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
         self._field = disc(shape, middle, radius_px)[self.box].copy() if isfinite(radius_px) else None
         if others and timed:
             noise = np.random.default_rng(0).random(shape, np.float32)
@@ -103,7 +107,8 @@ class ColourReconstructor:
         made = yield from run.green(green)
         eye = psf_wavefront(made.report, self._calibration.geometry)
         pictures: dict[Colour, Image] = {self._reference: made.picture}
-        others, gone = dict[Colour, Report](), list(missing)
+        others = dict[Colour, Report]()
+        gone = list(missing)
         for colour, counts in frames.items():
             try:
                 solved = yield from run.solve(colour, counts, dark, eye)
@@ -142,7 +147,8 @@ class ColourReconstructor:
         if field is None:
             reference = cropped[self._reference]
             field = lit_field(reference, Grid.periodic((reference.shape[0], reference.shape[1]), 1, inf))
-        joined, ratios = join_colours(cropped, field, n), white_ratios(self._calibration, lights_dn_per_s)
+        joined = join_colours(cropped, field, n)
+        ratios = white_ratios(self._calibration, lights_dn_per_s)
         channels = tuple(replace(one, white_ratio=ratios.get(one.name)) for one in joined.channels)
         picture = balanced(joined.picture, field, ratios)
         self.join_cost.add(self.clock.now_s() - begin_s)
@@ -166,7 +172,8 @@ def psf_wavefront(report: Report, geometry: Geometry | None) -> Wavefront | None
     """Return the wavefront of the PSF that a report states; None for the stored PSF."""
     if geometry is None or (report.psf_scale == 1 and report.psf_cylinder is None):
         return None
-    m_dpt, cylinder = (1 - report.psf_scale) / geometry.scale_per_dpt, report.psf_cylinder
+    m_dpt = (1 - report.psf_scale) / geometry.scale_per_dpt
+    cylinder = report.psf_cylinder
     if cylinder is None:
         return Wavefront(m_dpt)
     j0_dpt, j45_dpt = (float(cylinder[key] or 0.0) for key in ("j0_dpt", "j45_dpt"))  # of the correcting lens
@@ -177,7 +184,9 @@ class _Run:
     """State of one picture: time of the other colours, and deadline, which moves by the time of the consumer."""
 
     def __init__(self, owner: ColourReconstructor, deadline: Deadline | None) -> None:
-        self._owner, self._deadline, self.spent_s = owner, deadline, 0.0
+        self._owner = owner
+        self._deadline = deadline
+        self.spent_s = 0.0
 
     def green(self, steps: Iterator[Step]) -> Generator[Step, None, Reconstruction]:
         """Yield the steps before the picture, and return the picture."""
@@ -195,7 +204,8 @@ class _Run:
         FrameError for useless frames.
         """
         owner = self._owner
-        one, begin_s = owner.others[colour], owner.clock.now_s()
+        one = owner.others[colour]
+        begin_s = owner.clock.now_s()
         owner.refocus(colour, eye)
         deadline = None if self._deadline is None else self._deadline.later(-owner.join_cost.seconds)
         if isinstance(one, BurstReconstructor):

@@ -28,14 +28,14 @@ from device.recon.model.grid import Grid
 from device.recon.model.resampling import block_mean
 from device.values import Image, check_image_shape
 
-LEAST_PEAK, LEAST_OVER_SECOND, LEAST_OVERLAP = 0.5, 1.5, 0.2  # two different eyes have peaks of 0.26 to 0.44
+MIN_PEAK, MIN_OVER_SECOND, MIN_OVERLAP = 0.5, 1.5, 0.2  # two different eyes have peaks of 0.26 to 0.44
 # A small overlap correlates higher by chance, so its peak must be higher. Pictures of one retina have 0.70 to 0.96.
 SMALL_OVERLAP, PEAK_PER_OVERLAP = 0.4, 0.5
 FIELD_SAMPLES = 260  # across the field when registered: vessels stay resolved
 FEATHER_SHARE = 0.25  # of the field's radius over which a picture's weight rises from its edge
 RIM_PX = 3.0  # at the edge of a field, whose light falls off
 EDGE_SIGMA_PX, EDGE_SHARE = 1.0, 0.3  # smoothing against noise; least share of the median light, as in `lit_field`
-MOST_PICTURES, LEAST_PX = 64, 32
+MAX_PICTURES, MIN_PX = 64, 32
 ROUNDING_PX = 1e-6  # of a place that is a whole pixel
 
 Floats = NDArray[np.float64]
@@ -132,7 +132,8 @@ def place(
     projection = projection_of(None if px_per_deg is None else px_per_deg / n)
     placed = {0: Placement(0, True, STILL.shift, STILL.rotation_deg, None, None)}
     best: dict[int, tuple[Match, int]] = {}
-    newest, waiting = 0, set(range(1, len(flats)))
+    newest = 0
+    waiting = set(range(1, len(flats)))
     while waiting:
         progress(len(placed))
         search = MaskedCorrelator(flats[newest], projection)
@@ -157,13 +158,13 @@ def place(
 
 def refusal(match: Match) -> str | None:
     """Return the reason why a match is not accepted; None if it is."""
-    least = LEAST_PEAK + PEAK_PER_OVERLAP * max(0.0, SMALL_OVERLAP - match.overlap)
+    least = MIN_PEAK + PEAK_PER_OVERLAP * max(0.0, SMALL_OVERLAP - match.overlap)
     if match.peak <= least:
         return f"no picture shows the same part of the retina (correlation {match.peak:.2f}, more than {least:.2f})"
-    if match.peak <= LEAST_OVER_SECOND * match.second:
+    if match.peak <= MIN_OVER_SECOND * match.second:
         return f"the place is ambiguous (correlation {match.peak:.2f}, {match.second:.2f} at another place)"
-    if match.overlap <= LEAST_OVERLAP:
-        return f"the overlap of {match.overlap:.2f} of the field is too small (more than {LEAST_OVERLAP})"
+    if match.overlap <= MIN_OVERLAP:
+        return f"the overlap of {match.overlap:.2f} of the field is too small (more than {MIN_OVERLAP})"
     return None
 
 
@@ -172,14 +173,14 @@ def _rank(match: Match) -> tuple[bool, float]:
 
 
 def _refuse_different(pictures: Sequence[Image]) -> None:
-    if not 0 < len(pictures) <= MOST_PICTURES:
-        raise FrameError(f"a montage has 1 to {MOST_PICTURES} pictures, not {len(pictures)}", "Give fewer pictures.")
+    if not 0 < len(pictures) <= MAX_PICTURES:
+        raise FrameError(f"a montage has 1 to {MAX_PICTURES} pictures, not {len(pictures)}", "Give fewer pictures.")
     for one in pictures:
         check_image_shape(one.shape)
-        if min(one.shape[:2]) < LEAST_PX:
+        if min(one.shape[:2]) < MIN_PX:
             raise FrameError(
                 f"a picture of {one.shape[0]} x {one.shape[1]} pixels shows no vessels",
-                f"Give pictures of at least {LEAST_PX} x {LEAST_PX} pixels.",
+                f"Give pictures of at least {MIN_PX} x {MIN_PX} pixels.",
             )
     shapes = {one.shape for one in pictures}
     if len(shapes) > 1:

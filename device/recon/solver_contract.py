@@ -81,7 +81,8 @@ def check_method(method: Method) -> None:
 
 
 def _cases(method: Method) -> Iterator[_Planned]:
-    rng, planner = np.random.default_rng(0), Planner(None, effort="FFTW_ESTIMATE", threads=1)
+    rng = np.random.default_rng(0)
+    planner = Planner(None, effort="FFTW_ESTIMATE", threads=1)
     for shape in SHAPES:
         calibration = Calibration((Psf(_psf(shape, rng)),), Sensor())
         model = method.model(calibration, shape, 1, planner, 0)
@@ -92,7 +93,8 @@ def _cases(method: Method) -> Iterator[_Planned]:
 
 def _psf(shape: tuple[int, int], rng: np.random.Generator) -> Image:
     """Return a PSF of 40 random points within an eighth of the shorter side around the centre, with unit sum."""
-    psf, reach = np.zeros(shape, np.float32), min(shape) // 8
+    psf = np.zeros(shape, np.float32)
+    reach = min(shape) // 8
     rows, cols = rng.integers(-reach, reach + 1, (2, 40))
     np.add.at(psf, (shape[0] // 2 + rows, shape[1] // 2 + cols), 1 / 40)
     return psf

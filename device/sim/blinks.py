@@ -7,7 +7,7 @@ import numpy as np
 from device.sim.optical_setup import Scene
 
 BLINK_S = 0.25  # from the closing lid to the opening one
-LEAST_CHANCE = 0.01  # that a blink meets an exposure
+MIN_CHANCE = 0.01  # that a blink meets an exposure
 WINDOW_S = 10.0  # each has random numbers of its own, so that a moment's blinks do not depend on those before
 
 
@@ -15,10 +15,11 @@ def lid_share(scene: Scene, begin_s: float, exposure_s: float) -> float:
     """Return the share of an exposure during which the lid is closed, 0 to 1; `begin_s` is any clock's time, 0 or more.
 
     Blinks are a Poisson process of `blinks_per_min`, drawn from the scene's seed, if the chance that one meets an
-    exposure is at least LEAST_CHANCE; else there are none. The time in which two blinks overlap counts once.
+    exposure is at least MIN_CHANCE; else there are none. The time in which two blinks overlap counts once.
     """
-    per_s, end_s = scene.sim.eye.blinks_per_min / 60, begin_s + exposure_s
-    if per_s * (exposure_s + BLINK_S) < LEAST_CHANCE:
+    per_s = scene.sim.eye.blinks_per_min / 60
+    end_s = begin_s + exposure_s
+    if per_s * (exposure_s + BLINK_S) < MIN_CHANCE:
         return 0.0
     starts_s = np.concatenate(
         [

@@ -40,7 +40,8 @@ class SimCamera:
         if into is not None and (into.shape != self.shape or into.dtype != np.uint16):
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this sensor fills uint16 {self.shape}")
         world = self.world
-        begin_s, lamp = world.clock.now_s(), world.illumination
+        begin_s = world.clock.now_s()
+        lamp = world.illumination
         counts = self._read(shot, begin_s, into)
         world.clock.sleep(begin_s + shot.exposure_s - world.clock.now_s())
         if world.has_fault("camera.stalled"):

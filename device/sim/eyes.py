@@ -19,8 +19,8 @@ from device.sim.vessels import DISC
 from device.values import Colour, Eye, Image
 
 STEPS = 3  # of the drift from the first frame of a burst on; one frame later the eye is at its first place again
-LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
-MOST_PARTS = 4  # of an exposure; in a split into more each frame still has a quarter of its motion, which is too much
+MIN_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
+MAX_PARTS = 4  # of an exposure; in a split into more each frame still has a quarter of its motion, which is too much
 FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster eye, in a saccade, blurs each frame, but is not displaced between frames
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 Pair = tuple[float, float]
@@ -38,7 +38,9 @@ class RenderedEyes:
 
     def __init__(self, spec: InstrumentSpec, eye: Eye, choose: EffectSelector) -> None:
         self.scene = Scene(spec, spec.light.colour, eye)
-        self._choose, self.turn_deg, self._shows_card = choose, STRAIGHT, False
+        self._choose = choose
+        self.turn_deg = STRAIGHT
+        self._shows_card = False
         self._setups: dict[tuple[Eye, Colour, Pair], OpticalSetup] = {}
         self._rates: dict[tuple[Eye, Colour, int, int, Pair], Image] = {}
         self._retinas: dict[tuple[Eye, Pair], Fundus] = {}
@@ -58,7 +60,8 @@ class RenderedEyes:
 
         The scene's refraction is a wavefront, y downwards; that of lens and eye a correcting lens, y upwards.
         """
-        spec, eye = self.scene.spec, self.scene.sim.eye
+        spec = self.scene.spec
+        eye = self.scene.sim.eye
         m, j0, j45 = correction_behind(lens, vertex_mm, PowerVector(-eye.m_dpt, -eye.j0_dpt, eye.j45_dpt))
         behind = eye.model_copy(update={"m_dpt": -m, "j0_dpt": -j0, "j45_dpt": j45})
         sim = self.scene.sim.model_copy(update={"eye": behind})
@@ -85,7 +88,8 @@ class RenderedEyes:
         """
         key = eye, self.turn_deg
         if key not in self._retinas:
-            scene, camera = self.scene, self.scene.spec.camera
+            scene = self.scene
+            camera = self.scene.spec.camera
             px_per_deg = scene.geometry.px_per_deg
             light_deg = lit_deg(scene, self.plan)
             wide = int(np.ceil(px_per_deg * light_deg)) + 4
@@ -111,17 +115,17 @@ class RenderedEyes:
         speed = self.scene.sim.eye.drift_deg_per_s
         step_deg = (speed if speed <= FASTEST_DRIFT_DEG_PER_S else 0.0) * self.scene.spec.camera.exposure_s
         step_px = step_deg * self.scene.geometry.px_per_deg
-        return step_px if STEPS * step_px >= LEAST_DRIFT_PX else 0.0
+        return step_px if STEPS * step_px >= MIN_DRIFT_PX else 0.0
 
     @cached_property
     def torsion_deg(self) -> float:
         """Turn of the eye about its line of sight from one frame of a burst to the next, degrees; 0 if too small.
 
-        It is simulated if it moves the edge of the field by LEAST_DRIFT_PX over a burst.
+        It is simulated if it moves the edge of the field by MIN_DRIFT_PX over a burst.
         """
         step_deg = self.scene.sim.eye.torsion_deg_per_s * self.scene.spec.camera.exposure_s
         edge_px = np.radians(STEPS * abs(step_deg)) * self.scene.half_field_deg * self.scene.geometry.px_per_deg
-        return step_deg if edge_px >= LEAST_DRIFT_PX else 0.0
+        return step_deg if edge_px >= MIN_DRIFT_PX else 0.0
 
     @property
     def moves(self) -> bool:
@@ -129,10 +133,10 @@ class RenderedEyes:
         return self.drift_px != 0 or self.torsion_deg != 0
 
     def parts(self, exposure_s: float) -> int:
-        """Return how many exposures of this length fit into one of a picture, 1 to MOST_PARTS; 1 for a still eye."""
+        """Return how many exposures of this length fit into one of a picture, 1 to MAX_PARTS; 1 for a still eye."""
         if not (self.moves or self.scene.sim.eye.drift_deg_per_s):
             return 1
-        return min(max(1, round(self.scene.spec.camera.exposure_s / exposure_s)), MOST_PARTS)
+        return min(max(1, round(self.scene.spec.camera.exposure_s / exposure_s)), MAX_PARTS)
 
     def render_burst(self, eye: Eye, exposure_s: float) -> None:
         """Compute the light of an eye in the picture's colour for each frame of a burst of exposures of this length."""
@@ -157,9 +161,11 @@ class RenderedEyes:
         if key not in self._rates:
             setup = self.setup(eye, colour)
             if step > 0 or parts > 1:
-                scene, exposures = setup.scene, (step + 0.5) / parts - 0.5  # of the middle of the frame, like the blur
+                scene = setup.scene  # of the middle of the frame, like the blur
+                exposures = (step + 0.5) / parts - 0.5
                 radius_px = scene.geometry.px_per_deg * lit_deg(scene, self.plan) / 2
-                away_px, turn_deg = (0.0, exposures * self.drift_px), exposures * self.torsion_deg
+                away_px = (0.0, exposures * self.drift_px)
+                turn_deg = exposures * self.torsion_deg
                 moved = moved_behind_field(self.retina(eye), away_px, radius_px, turn_deg)
                 setup = build_setup(scene, moved, self._chosen(scene))
                 setup.drift_px = setup.drift_px[0] / parts, setup.drift_px[1] / parts

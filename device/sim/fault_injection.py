@@ -19,7 +19,8 @@ def inject_fault(world: World, name: str) -> None:
 
 def clear_faults(world: World) -> None:
     """Turn the lamp off and end the faults "moving" and "other mode"; a target changed by a fault stays changed."""
-    world.illumination, world.shake_px = None, 0
+    world.illumination = None
+    world.shake_px = 0
     world.faults.discard("camera.mode")
 
 

@@ -73,7 +73,8 @@ class Canvas:
         """Return a canvas of `inner` (rows, cols) and a margin, centred on FIELD_CENTRE_DEG."""
         shape = (inner[0] + 2 * margin_px, inner[1] + 2 * margin_px)
         down, right = (((np.arange(n) - (n - 1) / 2) / px_per_deg).astype(np.float32) for n in shape)
-        x, y = (right + FIELD_CENTRE_DEG[0])[None, :], (down + FIELD_CENTRE_DEG[1])[:, None]
+        x = (right + FIELD_CENTRE_DEG[0])[None, :]
+        y = (down + FIELD_CENTRE_DEG[1])[:, None]
         return cls(shape, px_per_deg, x, y, margin_px)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
@@ -134,7 +135,8 @@ def fundus(
     wide = int(np.ceil(px_per_deg * field_deg)) + 2
     inner = (wide + (wide - shape[0]) % 2, wide + (wide - shape[1]) % 2)  # centres of canvas and shape coincide
     canvas = Canvas.of(inner, px_per_deg, int(np.ceil(px_per_deg * beyond_deg)))
-    size, radius_px = canvas.shape, px_per_deg * (field_deg / 2 + beyond_deg)
+    size = canvas.shape
+    radius_px = px_per_deg * (field_deg / 2 + beyond_deg)
     rng = np.random.default_rng((seed, 2))
     vessels = grow(seed, field_deg / 2 + 1, FIELD_CENTRE_DEG, beyond_deg)
     lesion_rng = np.random.default_rng((seed, 3))  # separate stream: lesions leave the rest of the picture unchanged
@@ -177,7 +179,8 @@ def _ground(canvas: Canvas, rng: np.random.Generator, pigments: Pigments) -> dic
     nerve = 0.16 * np.exp(-((canvas.distance(DISC[0] - 0.5, DISC[1]) / 5.5) ** 2))
     planes: dict[Colour, Image] = {}
     for colour in COLOURS:
-        depth, choroid = pigments.macula(colour, MACULA[colour]), pigments.choroid(colour, CHOROID[colour])
+        depth = pigments.macula(colour, MACULA[colour])
+        choroid = pigments.choroid(colour, CHOROID[colour])
         macula = 1 - depth * np.exp(-((fovea / 2.7) ** 2)) - (AT_FOVEA - 1) * depth * np.exp(-((fovea / 0.8) ** 2))
         fibres = 1 + (0.3 if colour == "red" else 1.0) * nerve
         planes[colour] = shade * macula * fibres * (1 + choroid * web + 0.018 * grain)
@@ -195,7 +198,8 @@ def _choroid(canvas: Canvas, rng: np.random.Generator) -> Image:
 
 def _disc(canvas: Canvas, rng: np.random.Generator) -> tuple[Image, Image]:
     """Return the shares of optic disc and cup per pixel, 0 to 1; the rim is paler on the temporal side."""
-    x, y = canvas.x - np.float32(DISC[0]), canvas.y - np.float32(DISC[1])
+    x = canvas.x - np.float32(DISC[0])
+    y = canvas.y - np.float32(DISC[1])
     angle = np.arctan2(y, x)
     wobble = 1 + 0.025 * np.cos(2 * angle + rng.uniform(0, 6)) + 0.015 * np.cos(3 * angle + rng.uniform(0, 6))
     radius = np.hypot(x / np.float32(2.65), y / np.float32(2.95)) * wobble

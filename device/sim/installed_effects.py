@@ -37,7 +37,8 @@ def effects_of(scene: Scene) -> tuple[Effect, ...]:
 
 
 def _installed(entry: EntryPoint) -> Effect:
-    plugin, built_in = plugins.described(entry), [effect.name for effect in EFFECTS]
+    plugin = plugins.described(entry)
+    built_in = [effect.name for effect in EFFECTS]
     if entry.name in built_in:
         raise plugin.error("has the name of a built-in effect")
     found = plugins.load(entry)

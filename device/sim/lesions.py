@@ -39,7 +39,8 @@ def scatter(
         _blot(dark, x, y, rng, _random_place(rng, reach_deg, centre, 1.6), rng.uniform(0.09, 0.17), 0.75, rough=0.05)
     cluster = _random_place(rng, 0.35 * reach_deg, (0.0, 0.0), 2.5)
     for _ in range(exudates):
-        turn, far = rng.uniform(0, 2 * np.pi), abs(rng.normal(1.3, 0.45))
+        turn = rng.uniform(0, 2 * np.pi)
+        far = abs(rng.normal(1.3, 0.45))
         place = (cluster[0] + far * np.cos(turn), cluster[1] + far * np.sin(turn))
         _blot(bright, x, y, rng, place, rng.uniform(0.1, 0.32), rng.uniform(0.7, 1), rough=0.25)
     return Lesions(dark, bright)
@@ -50,8 +51,10 @@ def _random_place(
 ) -> tuple[float, float]:
     """Return a random (x, y) in the field, off the optic disc and more than `from_fovea` degrees from the fovea."""
     for _ in range(100):
-        far, turn = 0.92 * reach_deg * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
-        x, y = centre[0] + far * np.cos(turn), centre[1] + far * np.sin(turn)
+        far = 0.92 * reach_deg * np.sqrt(rng.random())
+        turn = rng.uniform(0, 2 * np.pi)
+        x = centre[0] + far * np.cos(turn)
+        y = centre[1] + far * np.sin(turn)
         if np.hypot(x, y) > from_fovea and np.hypot(x - 15.2, y + 1.5) > 4:
             break
     return float(x), float(y)
@@ -68,7 +71,8 @@ def _blot(
     rough: float,
 ) -> None:
     """Merge one spot with an irregular outline into the coverage `onto`, in place, as the pixel-wise maximum."""
-    lean, turn = rng.uniform(0.7, 1), rng.uniform(0, np.pi)
+    lean = rng.uniform(0.7, 1)
+    turn = rng.uniform(0, np.pi)
     waves = rng.normal(0, rough, 3) / np.array([1, 1.5, 2])
     phases = rng.uniform(0, 2 * np.pi, 3)
     near_x = np.flatnonzero(np.abs(x[0] - place[0]) < 3 * radius)
@@ -76,7 +80,8 @@ def _blot(
     if near_x.size == 0 or near_y.size == 0:
         return
     window = np.s_[near_y[0] : near_y[-1] + 1, near_x[0] : near_x[-1] + 1]
-    right, down = x[:, window[1]] - place[0], y[window[0]] - place[1]
+    right = x[:, window[1]] - place[0]
+    down = y[window[0]] - place[1]
     u = (np.cos(turn) * right + np.sin(turn) * down) * lean
     v = (np.cos(turn) * down - np.sin(turn) * right) / lean
     angle = np.arctan2(v, u)

@@ -56,7 +56,9 @@ def draw_object(
     and turns with the eye as a sphere (OPTICS.md 3.9). SpecError for a drawing that does not fit into the field, or a
     photograph that cannot be read.
     """
-    what, gaze, lit_deg = scene.object, scene.eye.gaze_deg, lit_deg or optics.field_deg
+    what = scene.object
+    gaze = scene.eye.gaze_deg
+    lit_deg = lit_deg or optics.field_deg
     gaze_deg = (gaze[0] + turn_deg[0], gaze[1] + turn_deg[1])
     at_deg = (what.at_deg[0] + gaze_deg[0], what.at_deg[1] + gaze_deg[1])
     if what.kind in ("retina", "image"):
@@ -104,13 +106,15 @@ def _moved_picture(
     lit_deg: float,
 ) -> Fundus:
     """Return a retina or photograph, shifted and turned (right, down), cropped by the light, which stays centred."""
-    what, is_retina = scene.object, scene.object.kind == "retina"
+    what = scene.object
+    is_retina = scene.object.kind == "retina"
     more_deg = (lit_deg - optics.field_deg) / 2
     if what.at_deg == gaze_deg == (0.0, 0.0) and what.size_deg is None:
         return _picture(scene, eye, shape, px_per_deg, optics.field_deg, more_deg)
     turn_deg = gaze_deg if is_retina else (0.0, 0.0)
     at_deg = what.at_deg if is_retina else (what.at_deg[0] + gaze_deg[0], what.at_deg[1] + gaze_deg[1])
-    wide_deg, beyond_deg = what.size_deg or optics.field_deg, 0.0
+    wide_deg = what.size_deg or optics.field_deg
+    beyond_deg = 0.0
     if is_retina:
         beyond_deg = more_deg + hypot(*at_deg) + hypot(*turn_deg)
     wide = ceil(px_per_deg * (max(wide_deg, optics.field_deg) + 2 * max(beyond_deg, more_deg))) + 4
@@ -189,7 +193,8 @@ def _crop_to_field(
 ) -> Fundus:
     """Return the middle of a larger picture, shifted, turned (down, right) and cropped to the round field."""
     radius_px = px_per_deg * half_field_deg
-    edge, field = _soft_field(shape, radius_px), field_mask(shape, radius_px)
+    edge = _soft_field(shape, radius_px)
+    field = field_mask(shape, radius_px)
     size = found.field.shape
     first = [(n - want) // 2 for n, want in zip(size, shape, strict=True)]
     window = tuple(slice(a, a + want) for a, want in zip(first, shape, strict=True))
@@ -225,12 +230,14 @@ def turned_places(places: Floats, turn_px: Pair, px_per_deg: float, *, back: boo
     length_px = hypot(*turn_px)
     if length_px == 0:
         return places
-    down, right = turn_px[0] / length_px, turn_px[1] / length_px
+    down = turn_px[0] / length_px
+    right = turn_px[1] / length_px
     by = np.radians(length_px / px_per_deg) * (-1 if back else 1)
     away_px = np.hypot(places[0], places[1])
     angle = np.radians(away_px / px_per_deg)
     shrunk = np.sinc(angle / np.pi) * np.radians(1 / px_per_deg)
-    along, across = shrunk * (down * places[0] + right * places[1]), shrunk * (down * places[1] - right * places[0])
+    along = shrunk * (down * places[0] + right * places[1])
+    across = shrunk * (down * places[1] - right * places[0])
     along, axial = np.cos(by) * along + np.sin(by) * np.cos(angle), np.cos(by) * np.cos(angle) - np.sin(by) * along
     sine = np.hypot(along, across)
     stretch = px_per_deg * np.degrees(np.arctan2(sine, axial)) / np.maximum(sine, SMALLEST_SINE)
@@ -328,7 +335,8 @@ def _refuse_drawing_beyond_field(what: ObjectSpec, focal_length_um: float, field
         "point": ("dot_um", what.dot_um, 0.0, 0.0, what.dot_um / 2),
     }[what.kind]
     x_um, y_um = (abs(float(v)) for v in _on_screen(np.float32(at_deg[0]), np.float32(at_deg[1]), focal_length_um))
-    reach_um, ends_um = hypot(x_um + right_um, y_um + down_um) + rim_um, height_um(field_deg / 2, focal_length_um)
+    reach_um = hypot(x_um + right_um, y_um + down_um) + rim_um
+    ends_um = height_um(field_deg / 2, focal_length_um)
     reach_deg = angle_deg(reach_um, focal_length_um)
     if reach_deg > field_deg / 2 + TOLERANCE_DEG:
         raise SpecError(

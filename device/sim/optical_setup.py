@@ -105,7 +105,8 @@ class Scene:
 
         By a budget an estimate from the mean of the lit disc; the frame itself has the mean of the budget.
         """
-        budget, peak_e = self.budget, self.sim.peak_e
+        budget = self.budget
+        peak_e = self.sim.peak_e
         if budget is not None:
             return budget.mean_e / MEAN_OVER_PEAK
         assert peak_e != "budget"
@@ -210,7 +211,8 @@ class OpticalSetup:
     @contextmanager
     def timed(self, *names: str) -> Iterator[None]:
         """Add the computing time of the context, without nested contexts, to `spent_ms` of `names` in equal parts."""
-        clock, booked_ms = SystemClock(), sum(self.spent_ms.values())
+        clock = SystemClock()
+        booked_ms = sum(self.spent_ms.values())
         begin_s = clock.now_s()
         yield
         inside_ms = sum(self.spent_ms.values()) - booked_ms

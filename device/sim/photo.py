@@ -28,10 +28,15 @@ def photograph(
             f"the scene's image {path} cannot be read: {error}", "Give the path of a photograph."
         ) from error
     side = min(rgb.size)
-    left, top = (rgb.width - side) // 2, (rgb.height - side) // 2
-    box, wide_deg, tall_deg = (left, top, left + side, top + side), field_deg, field_deg
+    left = (rgb.width - side) // 2
+    top = (rgb.height - side) // 2
+    box = (left, top, left + side, top + side)
+    wide_deg = field_deg
+    tall_deg = field_deg
     if width_deg is not None:
-        box, wide_deg, tall_deg = (0, 0, *rgb.size), width_deg, width_deg * rgb.height / rgb.width
+        box = (0, 0, *rgb.size)
+        wide_deg = width_deg
+        tall_deg = width_deg * rgb.height / rgb.width
     size = max(1, round(px_per_deg * wide_deg)), max(1, round(px_per_deg * tall_deg))
     scaled = rgb.resize(size, Pictures.Resampling.LANCZOS, box, 3.0)
     pixels = np.asarray(scaled, np.float32) / np.float32(255)

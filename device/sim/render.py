@@ -55,7 +55,8 @@ def electrons_per_s(setup: OpticalSetup) -> Image:
 
 def _gain_e(setup: OpticalSetup, image: Image) -> float:
     """Return the electrons of one exposure per unit of `image`, by the scene's peak or by its budget."""
-    scene, budget = setup.scene, setup.scene.budget
+    scene = setup.scene
+    budget = setup.scene.budget
     if budget is None:
         return scene.peak_e / max(float(image.max()), 1e-30)
     return budget.mean_e * budget.disc_px / max(float(setup.object.sum(dtype=np.float64)), 1e-30)
@@ -70,7 +71,9 @@ def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
     m, j0, j45 = setup.refraction
     for aberration in setup.aberrations.values():
         more = aberration(place)
-        m, j0, j45 = m + more.m_dpt, j0 + more.j0_dpt, j45 + more.j45_dpt
+        m = m + more.m_dpt
+        j0 = j0 + more.j0_dpt
+        j45 = j45 + more.j45_dpt
     beam = None
     if setup.beams:
         shifts = [shift(place) for shift in setup.beams.values()]
@@ -139,7 +142,8 @@ def convolved(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drif
 
 def zones(setup: OpticalSetup) -> Iterator[Zone]:
     """Yield the isoplanatic zones of the object; only one for a point, or if no effect varies over the field."""
-    spec, gaze = setup.scene.sim.object, setup.scene.sim.eye.gaze_deg
+    spec = setup.scene.sim.object
+    gaze = setup.scene.sim.eye.gaze_deg
     if not setup.aberrations and not setup.beams:
         yield Zone((0.0, 0.0), setup.object)
     elif spec.kind == "point":  # a point has exactly one PSF
@@ -193,7 +197,8 @@ def azimuth_and_angle(place: Place) -> tuple[float, float]:
 def crop_or_pad(image: Image, shape: tuple[int, int], middle: tuple[int, int] | None = None) -> Image:
     """Return a float32 copy cropped or zero-padded to `shape`, with `middle` (default: rows//2, cols//2) as centre."""
     out = np.zeros(shape, np.float32)
-    into, of = [], []
+    into = []
+    of = []
     for size, have, centre in zip(
         shape, image.shape, middle or (image.shape[0] // 2, image.shape[1] // 2), strict=True
     ):

@@ -54,7 +54,8 @@ def find_recording(folder: Path) -> ReplaySpec:
             "Add a recording.toml that names them, or give them with --raw and --psf.",
         )
     shape = read_counts(raws[0]).shape[:2]
-    fitting, unreadable = [], []
+    fitting = []
+    unreadable = []
     for path in psfs:
         try:
             fitting += [path] if read_counts(path).shape[:2] == shape else []

@@ -21,7 +21,7 @@ from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, Counts, ExposureSettings, Illumination, Image, Mask
 
-MOST_FRAMES = 64  # of one burst
+MAX_FRAMES = 64  # of one burst
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,10 @@ def expose(spec: InstrumentSpec, choose: EffectSelector = decide, count: int = 1
     """Return the simulated world of a scene, and `count` lit frames in the picture's colour: counts, (rows, cols).
 
     The frames are one burst: one diffuser and one eye, which moves as the scene says, each with noise of its own.
-    SpecError for a spec without [optics] or [sim], SettingError for a count outside 1 to MOST_FRAMES.
+    SpecError for a spec without [optics] or [sim], SettingError for a count outside 1 to MAX_FRAMES.
     """
-    if not 1 <= count <= MOST_FRAMES:
-        raise SettingError(f"{count} frames cannot be simulated at once", f"Give 1 to {MOST_FRAMES} frames.")
+    if not 1 <= count <= MAX_FRAMES:
+        raise SettingError(f"{count} frames cannot be simulated at once", f"Give 1 to {MAX_FRAMES} frames.")
     world = World(spec, VirtualClock(), choose=choose)
     return world, lit_frames(world, count)
 
@@ -74,7 +74,8 @@ def lit_frames(world: World, count: int = 1) -> tuple[Counts, ...]:
 
     The light is traced before it is lit.
     """
-    spec, camera = world.spec, SimCamera(world)
+    spec = world.spec
+    camera = SimCamera(world)
     world.electrons_per_s(spec.light.colour)
     with SimLight(world).on(Illumination(spec.light.colour)):
         return tuple(camera.expose(ExposureSettings(spec.camera.exposure_s)).counts for _ in range(count))

@@ -63,7 +63,8 @@ def calibration_point(world: World, moved_mm: float = 0.0, colour: Colour | None
     A source `moved_mm` farther from the model eye's lens acts as in a longer eye, M = 1/f - 1/s with s = f + moved_mm,
     and appears smaller. `colour` None: the picture's colour.
     """
-    setup, spec = world.setup(colour or world.spec.light.colour), world.scene.sim.calibration
+    setup = world.setup(colour or world.spec.light.colour)
+    spec = world.scene.sim.calibration
     eye_mm = world.scene.sim.eye.focal_length_um / 1000
     point_setup = OpticalSetup(setup.scene, setup.subject, setup.sensor, lines=setup.lines)
     longer_dpt = -correction_dpt(eye_mm + moved_mm, eye_mm)

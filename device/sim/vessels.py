@@ -122,7 +122,8 @@ def grow(seed: int, reach_deg: float, centre: tuple[float, float], beyond_deg: f
     garden = GrowthState(np.random.default_rng((seed, 1)), reach_deg, centre)
     vessels, left = _grown(garden, [(_sprout(garden, trunk), []) for trunk in TRUNKS])
     if beyond_deg > 0:
-        garden.reach_deg, garden.rng = reach_deg + beyond_deg, np.random.default_rng((seed, 4))
+        garden.reach_deg = reach_deg + beyond_deg
+        garden.rng = np.random.default_rng((seed, 4))
         vessels += _grown(garden, left)[0]
     return vessels
 
@@ -135,7 +136,8 @@ def _grown(garden: GrowthState, waiting: list[tuple[Tip, Path]]) -> tuple[list[V
 
     The end of the path, full width over the length of a taper, is drawn again by the continuation.
     """
-    vessels, left = [], []
+    vessels = []
+    left = []
     while waiting:
         waiting.sort(key=lambda one: -one[0].width_deg)
         tip, before = waiting.pop(0)
@@ -154,7 +156,8 @@ def _sprout(garden: GrowthState, trunk: Trunk) -> Tip:
     rng = garden.rng
     heading = math.radians(trunk.heading_deg + rng.normal(0, 6))
     arch = None if trunk.arch is None else trunk.arch + rng.normal(0, 0.5)
-    x, y = DISC[0] + 0.35 + 0.3 * math.cos(heading), DISC[1] + 0.5 * math.sin(heading)
+    x = DISC[0] + 0.35 + 0.3 * math.cos(heading)
+    y = DISC[1] + 0.5 * math.sin(heading)
     side = 1 if rng.random() < 0.5 else -1
     return garden.number_tip(Tip(trunk.kind, x, y, heading, trunk.width_deg * rng.uniform(0.9, 1.1), arch, side=side))
 

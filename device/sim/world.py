@@ -68,7 +68,8 @@ class World:
         self.faults: set[str] = set()
         self.frames = 0
         self.lit_frames = 0  # since the lamp was turned on
-        self.temperature_c, self.battery_state = REFERENCE_C, BatteryState(0.775, 3.88)
+        self.temperature_c = REFERENCE_C
+        self.battery_state = BatteryState(0.775, 3.88)
         self.identity: HeadIdentity | None = None
         self.pressed_since_s: float | None = None
 
@@ -113,7 +114,8 @@ class World:
 
         With a calibration target, full well and white level are limited even if saturation is not simulated.
         """
-        sensor, camera = self.setup(self.spec.light.colour).sensor, self.spec.camera
+        sensor = self.setup(self.spec.light.colour).sensor
+        camera = self.spec.camera
         if self.target is None:
             return sensor
         return replace(sensor, full_well_e=camera.full_well_e, white_dn=camera.white_dn)
@@ -161,7 +163,8 @@ class World:
             return np.broadcast_to(unlit_e, self.shape)
         step, parts = 0, 1
         if glow.colour == self.spec.light.colour:
-            step, parts = self.lit_frames if self.eyes.moves else 0, self.eyes.parts(exposure_s)
+            step = self.lit_frames if self.eyes.moves else 0
+            parts = self.eyes.parts(exposure_s)
         returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step, parts)
         begin_s = self.clock.now_s() - exposure_s if begin_s is None else begin_s
         closed = 1.0 if self.has_fault("eye.closed") else lid_share(self.scene, max(begin_s, 0.0), exposure_s)

@@ -35,7 +35,8 @@ def read_board(name: str) -> Board:
     Footprints stand unrotated, so that a pad's place is the sum of two.
     """
     root = parse(BOARDS[name].read_text(encoding="utf-8"))
-    pads, holes = dict[Pin, Pad](), list[tuple[float, float, float]]()
+    pads = dict[Pin, Pad]()
+    holes = list[tuple[float, float, float]]()
     for one in children(root, "footprint"):
         fields = {str(field[1]): str(field[2]) for field in children(one, "property")}
         x_mm, y_mm, *rotation = numbers(one, "at")

@@ -15,9 +15,18 @@ from hardware.gate.netlist import Netlist, Pin
 Light = Literal["dark", "lit", "unknown"]
 GROUND, SUPPLY, LOGIC, LED_SUPPLY, HEARTBEAT = "GND", "+5V", "+3V3", "+5V_LED", "HEARTBEAT"
 SWITCH, ONE_SHOT = "U1", "U2"
-IN, SWITCH_GROUND, ENABLE, OUT = (SWITCH, "1"), (SWITCH, "2"), (SWITCH, "3"), (SWITCH, "6")
-A, B, CLEAR, SHOT_GROUND = (ONE_SHOT, "1"), (ONE_SHOT, "2"), (ONE_SHOT, "3"), (ONE_SHOT, "4")
-Q, CEXT, RCEXT, SHOT_SUPPLY = (ONE_SHOT, "5"), (ONE_SHOT, "6"), (ONE_SHOT, "7"), (ONE_SHOT, "8")
+IN = (SWITCH, "1")
+SWITCH_GROUND = (SWITCH, "2")
+ENABLE = (SWITCH, "3")
+OUT = (SWITCH, "6")
+A = (ONE_SHOT, "1")
+B = (ONE_SHOT, "2")
+CLEAR = (ONE_SHOT, "3")
+SHOT_GROUND = (ONE_SHOT, "4")
+Q = (ONE_SHOT, "5")
+CEXT = (ONE_SHOT, "6")
+RCEXT = (ONE_SHOT, "7")
+SHOT_SUPPLY = (ONE_SHOT, "8")
 GATE = (SWITCH, ONE_SHOT, "C1", "C2", "C3", "R1", "R2", "R3", "R4", "R5", "R6", "R7")
 
 
@@ -33,7 +42,8 @@ class Failure:
 def failures(netlist: Netlist, components: tuple[str, ...] = GATE) -> Iterator[Failure]:
     """Yield every pin of the gate open, every two-pin part short, every two neighbouring pins of a chip short."""
     for ref in components:
-        pins, label = netlist.pins(ref), f"{netlist.parts[ref]} {ref}"
+        pins = netlist.pins(ref)
+        label = f"{netlist.parts[ref]} {ref}"
         if len(pins) == 2:
             yield Failure(f"{label} open", netlist.opened(pins[0]))
             yield Failure(f"{label} short", netlist.shorted(*pins))
@@ -76,7 +86,8 @@ class _State:
     """Levels of the nets of a failed gate after the heartbeat has stopped; None: floating, or not known."""
 
     def __init__(self, failure: Failure, line_high: bool) -> None:
-        self._nets, self._failure = failure.netlist, failure
+        self._nets = failure.netlist
+        self._failure = failure
         self._fixed: dict[str, bool] = {HEARTBEAT: line_high}
         self._names = self._joined()
 

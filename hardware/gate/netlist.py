@@ -28,7 +28,8 @@ class Netlist:
 
     def shorted(self, one: Pin, other: Pin) -> "Netlist":
         """Return the netlist with the nets of two pins joined under the name of the first; unchanged if one is open."""
-        kept, gone = self.nets[one], self.nets[other]
+        kept = self.nets[one]
+        gone = self.nets[other]
         if kept is None or gone is None:
             return self
         return replace(self, nets={pin: kept if net == gone else net for pin, net in self.nets.items()})
@@ -44,10 +45,14 @@ def read(path: Path = SCHEMATIC) -> Netlist:
     symbols = {str(one[1]): _pin_places(one) for one in children(child(root, "lib_symbols"), "symbol")}
     labels = {_place(one): str(one[1]) for one in children(root, "global_label")}
     opened = {_place(one) for one in children(root, "no_connect")}
-    values, parts, names, nets = dict[str, str](), dict[str, str](), dict[Pin, str](), dict[Pin, str | None]()
+    values = dict[str, str]()
+    parts = dict[str, str]()
+    names = dict[Pin, str]()
+    nets = dict[Pin, str | None]()
     for one in children(root, "symbol"):
         fields = {str(field[1]): str(field[2]) for field in children(one, "property")}
-        ref, (x, y) = fields["Reference"], _place(one)
+        ref = fields["Reference"]
+        (x, y) = _place(one)
         values[ref], parts[ref] = fields["Value"], fields["Part"]
         for number, (name, right, up) in symbols[str(child(one, "lib_id")[1])].items():
             at = (round(x + right, 2), round(y - up, 2))

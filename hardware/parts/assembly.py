@@ -28,7 +28,8 @@ class Printed:
     def on_the_bed(self, d: Dimensions) -> Part:
         """The part as it is printed: turned, and standing on z = 0 above the origin."""
         turned = self.shape(d).moved(Plane((0, 0, 0), z_dir=self.up).location.inverse())
-        low, high = turned.bounding_box().min, turned.bounding_box().max
+        low = turned.bounding_box().min
+        high = turned.bounding_box().max
         return turned.moved(Location((-(low.X + high.X) / 2, -(low.Y + high.Y) / 2, -low.Z)))
 
 

@@ -18,7 +18,8 @@ def diffuser(d: Dimensions) -> Part:
 
 def camera(d: Dimensions) -> Part:
     """Board and sensor with its cover glass; the board's own lens mount is off."""
-    front, part = d.board_z_mm, d.bought
+    front = d.board_z_mm
+    part = d.bought
     half = part.board_holes_mm / 2
     holes = joined(rod(2.5, (front, front + part.board_thick_mm), (i * half, j * half)) for i, j in FOUR)
     glass = d.image_z_mm - part.cover_to_image_mm - part.cover_glass_mm
@@ -39,9 +40,12 @@ def led_film(d: Dimensions) -> Part:
 
 def led_matrix(d: Dimensions) -> Part:
     """The LuMini 8 x 8 with its ears, holes and 64 LEDs."""
-    part, (x, z), (wide, high) = d.bought, d.led_board_at_mm, d.bought.led_board_mm
+    part = d.bought
+    (x, z) = d.led_board_at_mm
+    (wide, high) = d.bought.led_board_mm
     front = d.led_y_mm + part.led_high_mm
-    y, ear = (front, front + part.led_board_thick_mm), part.led_ear_mm
+    y = (front, front + part.led_board_thick_mm)
+    ear = part.led_ear_mm
     board = box((x - wide / 2, x + wide / 2), y, (z - high / 2, z + high / 2))
     for side in (-1, 1):
         gap = (x + side * high / 2, x + side * wide / 2)
@@ -65,7 +69,8 @@ def beam_splitter(d: Dimensions) -> Part:
 def lens_tube(d: Dimensions) -> Part:
     """The end of the tube that holds the second lens."""
     _, floor = tube_flange.tube_z_mm(d)
-    z, at = (floor - 30, floor), (0, d.lens_y_mm)
+    z = (floor - 30, floor)
+    at = (0, d.lens_y_mm)
     return rod(d.bought.tube_mm, z, at) - rod(d.bought.tube_mm - 4, z, at)
 
 

@@ -124,7 +124,8 @@ class Dimensions:
     @property
     def lens_y_mm(self) -> float:
         """How far the lenses' axis lies above the iris's: the tilted plate moves what passes it sideways."""
-        tilt, glass = radians(45), named_glass(self.path.glass, self._layout.plate_glass, "the beam splitter")
+        tilt = radians(45)
+        glass = named_glass(self.path.glass, self._layout.plate_glass, "the beam splitter")
         index = glass.index(self.path.optics.wavelength_um)
         return self.plate_thick_mm * sin(tilt) * (1 - cos(tilt) / sqrt(index**2 - sin(tilt) ** 2))
 
@@ -152,7 +153,8 @@ class Dimensions:
     @property
     def led_screws_mm(self) -> list[Place]:
         """(x, z) of the LED board's four screws."""
-        (x, z), (wide, high) = self.led_board_at_mm, self.bought.led_holes_mm
+        (x, z) = self.led_board_at_mm
+        (wide, high) = self.bought.led_holes_mm
         return [(x + i * wide / 2, z + j * high / 2) for i, j in FOUR]
 
     @property

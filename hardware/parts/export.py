@@ -15,7 +15,8 @@ def export(d: Dimensions, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for part in printed().values():
-        shape, stem = part.on_the_bed(d), folder / part.name.replace(" ", "-").lower()
+        shape = part.on_the_bed(d)
+        stem = folder / part.name.replace(" ", "-").lower()
         export_step(shape, stem.with_suffix(".step"))
         export_stl(shape, stem.with_suffix(".stl"), tolerance=FINE_MM, angular_tolerance=FINE_RAD)
         written += [stem.with_suffix(".step"), stem.with_suffix(".stl")]

@@ -143,12 +143,15 @@ def step(name: str, d: Dimensions) -> str:
 
 def relay(d: Dimensions) -> str:
     """The lenses cut along their axis, with the tube at its stop: which face looks where, and distances."""
-    faces, half = traced_relay(d.path).lamp_surfaces, d.path.relay.lens_mm / 2
-    pupil, iris = faces[0].at_mm - d.pupil_to_glass_mm, faces[-1].at_mm - d.tube_stop_z_mm
+    faces = traced_relay(d.path).lamp_surfaces
+    half = d.path.relay.lens_mm / 2
+    pupil = faces[0].at_mm - d.pupil_to_glass_mm
+    iris = faces[-1].at_mm - d.tube_stop_z_mm
     lenses = [_lens(faces[first : first + 3], half) for first in range(0, len(faces), 3)]
     planes = [Drawn("", z, -half, z, half) for z in (pupil, iris)]
     sheet = Sheet("Step 1, relay: the lenses cut along their axis", [*lenses, *planes], 4.0)
-    last, second = len(faces) // 2 - 1, len(faces) // 2
+    last = len(faces) // 2 - 1
+    second = len(faces) // 2
     spans = [(pupil, faces[0].at_mm), (faces[last].at_mm, faces[second].at_mm), (faces[-1].at_mm, iris)]
     over = []
     for begin, end in spans:
@@ -156,7 +159,8 @@ def relay(d: Dimensions) -> str:
         x, y = sheet.at(((begin + end) / 2, 0))
         over.append(text(x, y - 8, f"{end - begin:.1f} mm", MEASURE, "middle"))
     for words, z in (("pupil of the eye", pupil), ("iris", iris)):
-        (x, top), (_, bottom) = sheet.at((z, half)), sheet.at((z, -half))
+        (x, top) = sheet.at((z, half))
+        (_, bottom) = sheet.at((z, -half))
         over += [line(x, top, x, bottom, "measure"), text(x, top - 8, words, "small name", "middle")]
     for words, first, end in (("doublets 75 mm", 0, last), ("doublets 100 mm", second, -1)):
         x, y = sheet.at(((faces[first].at_mm + faces[end].at_mm) / 2, half))
@@ -203,19 +207,26 @@ def section(d: Dimensions) -> str:
 
 def _light(d: Dimensions) -> str:
     """The field's outermost light: from the plate's front through the iris to the sensor."""
-    relay, field, begin = relay_of(d.path, d.path.optics), d.path.optics.field_deg, d.block_z_mm[0]
-    before, iris = relay.beam_before_iris_mm(field, -begin) / 2, d.iris_mm / 2
-    end, sensor = d.image_z_mm, d.iris_mm / 2 + field_extent.half_shift_tan_mm(relay, field)
+    relay = relay_of(d.path, d.path.optics)
+    field = d.path.optics.field_deg
+    begin = d.block_z_mm[0]
+    before = relay.beam_before_iris_mm(field, -begin) / 2
+    iris = d.iris_mm / 2
+    end = d.image_z_mm
+    sensor = d.iris_mm / 2 + field_extent.half_shift_tan_mm(relay, field)
     upper = [(0, iris), (end, sensor), (end, -sensor), (0, -iris)]
-    plate, at_plate = d.plate_z_mm, relay.beam_before_iris_mm(field, -d.plate_z_mm) / 2
-    low, high = d.lens_y_mm - before, d.lens_y_mm + before
+    plate = d.plate_z_mm
+    at_plate = relay.beam_before_iris_mm(field, -d.plate_z_mm) / 2
+    low = d.lens_y_mm - before
+    high = d.lens_y_mm + before
     return _outline([*upper, (plate, -at_plate), (begin, low), (begin, high), (plate, at_plate)])
 
 
 def _led_light(d: Dimensions, x_mm: float) -> list[str]:
     """What the cap lets out of each LED in this cut, down to the plate or to the bore around it."""
     slope = d.led_hole_mm / 2 / (d.led_y_mm - d.cap_end_y_mm)
-    long, bore = d.led_y_mm - d.lens_y_mm, d.plate_seen_mm / 2
+    long = d.led_y_mm - d.lens_y_mm
+    bore = d.plate_seen_mm / 2
     outlines = []
     for off in (z - d.plate_z_mm for x, z in d.ring_places_mm if x == x_mm):
         places = [(off, long)]
@@ -235,14 +246,18 @@ def _outline(places: list[tuple[float, float]]) -> str:
 
 def _measures(sheet: Sheet, d: Dimensions) -> list[str]:
     """Three distances of `optics.toml`, between the planes that they join."""
-    optics, relay = d.path.optics, d.path.relay
-    deep, plate, image = -8.0, d.plate_z_mm, d.image_z_mm
+    optics = d.path.optics
+    relay = d.path.relay
+    deep = -8.0
+    plate = d.plate_z_mm
+    image = d.image_z_mm
     lines = [
         sheet.measure((plate, deep), (0, deep)),
         sheet.measure((0, deep), (image, deep)),
         sheet.measure((plate, d.lens_y_mm), (plate, d.led_y_mm)),
     ]
-    splitter, air = f"{relay.splitter_to_iris_mm:g} mm", f"{optics.diffuser_to_sensor_um / 1000:g} mm in air"
+    splitter = f"{relay.splitter_to_iris_mm:g} mm"
+    air = f"{optics.diffuser_to_sensor_um / 1000:g} mm in air"
     x, y = sheet.at((plate, d.led_y_mm * 0.6))
     return [
         *lines,
@@ -254,11 +269,16 @@ def _measures(sheet: Sheet, d: Dimensions) -> list[str]:
 
 def printed(d: Dimensions) -> str:
     """Every printed part as it lies on the printer's bed."""
-    view, cols, wide, high = View((-0.5, -0.62, 0.75), (0, 0, 1)), 5, 88.0, 88.0
-    drawn, names = [], list(assembly.printed())
+    view = View((-0.5, -0.62, 0.75), (0, 0, 1))
+    cols = 5
+    wide = 88.0
+    high = 88.0
+    drawn = []
+    names = list(assembly.printed())
     for i, part in enumerate(assembly.printed().values()):
         seen = view.seen(part.on_the_bed(d), "printed")
-        x, y = (i % cols) * wide - seen.middle[0], -(i // cols) * high - seen.middle[1]
+        x = (i % cols) * wide - seen.middle[0]
+        y = -(i // cols) * high - seen.middle[1]
         box = seen.left + x, seen.low + y, seen.right + x, seen.high + y
         drawn.append(Drawn(f'<g transform="translate({x:.1f} {-y:.1f})">{seen.svg}</g>', *box))
     sheet = Sheet("What is printed, as it lies on the bed", drawn, 2.4, top=40)

@@ -19,7 +19,10 @@ STYLE_HERE = """
   }
 """
 CALLED = {"LED film": "polariser film", "eye lens": "lens", "lever": "M2 screw"}  # what labels say
-MARGIN, ROW_PX, LETTER_PX, ROWS = 48, 18, 6.8, 20
+MARGIN = 48
+ROW_PX = 18
+LETTER_PX = 6.8
+ROWS = 20
 MEASURE = "small label s3"
 
 
@@ -29,7 +32,8 @@ class Sheet:
     def __init__(self, title: str, drawn: Iterable[Drawn], px_per_mm: float, top: int = 90, beside: int = 0) -> None:
         every = list(drawn)
         self.title, self.scale, self.top = title, px_per_mm, top
-        self.left, self.high = min(one.left for one in every), max(one.high for one in every)
+        self.left = min(one.left for one in every)
+        self.high = max(one.high for one in every)
         self.wide = round((max(one.right for one in every) - self.left) * px_per_mm) + 2 * MARGIN + beside
         self.tall = round((self.high - min(one.low for one in every)) * px_per_mm) + 2 * MARGIN + top
 
@@ -46,7 +50,8 @@ class Sheet:
 
     def measure(self, begin: tuple[float, float], end: tuple[float, float]) -> str:
         """A line between two places along one axis, with a tick at each end."""
-        (x1, y1), (x2, y2) = self.at(begin), self.at(end)
+        (x1, y1) = self.at(begin)
+        (x2, y2) = self.at(end)
         tick = (0, 6) if y1 == y2 else (6, 0)
         strokes = [(x1, y1, x2, y2)]
         strokes += [(x - tick[0], y - tick[1], x + tick[0], y + tick[1]) for x, y in ((x1, y1), (x2, y2))]

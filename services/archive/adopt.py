@@ -60,7 +60,8 @@ def adopt_results(folder: Path, store: Path, clock: Clock, progress: Callable[[s
         raise SettingError(f"{folder} holds no run", "Give the folder of diffuscope archive run.")
     if not (store / "captures").is_dir():
         raise RecordNotFound(f"{store} holds no captures", "Give the folder of the captures with --data.")
-    plan, results = read_plan(folder / PLAN), ResultFolder(folder)
+    plan = read_plan(folder / PLAN)
+    results = ResultFolder(folder)
     with ExitStack() as undo:
         with storage_errors():
             refuse_in_use(store / schema.DATABASE)
@@ -109,7 +110,9 @@ def _adopt(
     planned: PlannedCapture, results: ResultFolder, software: Mapping[str, str], store: CaptureStore, clock: Clock
 ) -> None:
     store.space.refuse_without_room()
-    capture, stored, place = store.get(planned.id), results.read(planned.result), results.place(planned.result)
+    capture = store.get(planned.id)
+    stored = results.read(planned.result)
+    place = results.place(planned.result)
     try:
         picture = _shown(read_linear(place / PICTURE), stored.field_px)
         colour = read_linear(place / COLOUR_PICTURE) if (place / COLOUR_PICTURE).is_file() else None

@@ -142,7 +142,8 @@ def _planned(found: FoundCalibration) -> PlannedCalibration:
     if found.archived is None:
         return PlannedCalibration(digest=digest, label=found.psfs[0].name, files=files)
     kept = parse_calibration({Path(one.path).name: Path(one.path).read_bytes() for one in files})
-    made_at, label = kept.provenance.made_at.isoformat(), kept.provenance.serial
+    made_at = kept.provenance.made_at.isoformat()
+    label = kept.provenance.serial
     assert MANIFEST in {Path(one.path).name for one in files}
     return PlannedCalibration(digest=digest, label=label, files=files, id=found.archived.name, made_at=made_at)
 

@@ -26,7 +26,7 @@ from services.research.reconstruct_file import write_or_raise
 SHOWN = 6  # pictures of the largest improvements, and of the largest losses
 SIDE_PX = 360
 NAMED = 5  # captures of a message that are named
-MOST_MARKS = 2_000  # of a plot; a larger table is sampled evenly
+MAX_MARKS = 2_000  # of a plot; a larger table is sampled evenly
 LOSS_DB = -0.1  # less is within the fit of intensity
 LOSS_RATIO = 0.98
 DONE = "done"  # state of a capture with a result
@@ -102,11 +102,13 @@ def changes(columns: Columns) -> list[Change]:
     psnr, before_psnr, cutoff, before_cutoff = (columns.numbers(name) for name in names)
     found = []
     for row, id in enumerate(columns.words("id")):
-        after, before = psnr[row], before_psnr[row]
+        after = psnr[row]
+        before = before_psnr[row]
         if after is not None and before is not None:
             found.append(Change(id, before, after, "dB", row))
             continue
-        after, before = cutoff[row], before_cutoff[row]
+        after = cutoff[row]
+        before = before_cutoff[row]
         if after is not None and before:
             found.append(Change(id, before, after, "cycles/px", row))
     return found
@@ -149,7 +151,7 @@ def _summary(folder: Path, columns: Columns) -> str:
     rows = [[state, str(count)] for state, count in states.most_common()]
     kept = folder / PLAN
     words = ""
-    if kept.is_file() and len(columns) < MOST_MARKS:  # a large plan takes seconds to parse
+    if kept.is_file() and len(columns) < MAX_MARKS:  # a large plan takes seconds to parse
         plan = read_plan(kept)
         given = {key: value for key, value in plan.settings.model_dump().items() if value is not None}
         versions = ", ".join(f"{name} {value}" for name, value in plan.software.items())
@@ -169,7 +171,8 @@ def _quality(found: list[Change]) -> str:
     for unit in ("dB", "cycles/px"):
         some = [one for one in found if one.unit == unit]
         if some:
-            before, after = fmean(one.before for one in some), fmean(one.after for one in some)
+            before = fmean(one.before for one in some)
+            after = fmean(one.after for one in some)
             worse = sum(one.is_loss for one in some)
             name = "PSNR (dB)" if unit == "dB" else "cut-off frequency (cycles/px)"
             rows.append([name, str(len(some)), f"{before:.4g}", f"{after:.4g}", str(worse)])
@@ -187,9 +190,10 @@ def _scatter(title: str, x: str, y: str, points: Sequence[tuple[float, float, st
     """Return a plot of points (x, y, label) as an SVG picture; empty if there is nothing to draw."""
     if len(points) < 2:
         return ""
-    points = points[:: max(1, len(points) // MOST_MARKS)]
+    points = points[:: max(1, len(points) // MAX_MARKS)]
     trails = tuple((Mark(one, other, "", f"{label}: {one:.4g}, {other:.4g}", 0.5),) for one, other, label in points)
-    across, up = value_axis([one for one, _, _ in points], x), value_axis([other for _, other, _ in points], y)
+    across = value_axis([one for one, _, _ in points], x)
+    up = value_axis([other for _, other, _ in points], y)
     plot = Plot(title, "", f"{y} against {x}", across, up, (Series("capture", trails),), height=420)
     drawn = svg(plot)
     return _image("image/svg+xml", drawn.encode(), title)
@@ -218,7 +222,9 @@ def _least_explained(folder: Path, columns: Columns) -> str:
     """Return the pictures with the largest residuals: the frames that PSF and picture explain least."""
     residuals = columns.numbers("residual")
     worst = sorted((-value, row) for row, value in enumerate(residuals) if value is not None)[:SHOWN]
-    ids, places, simulated = columns.words("id"), columns.words("picture"), columns.values("simulated")
+    ids = columns.words("id")
+    places = columns.words("picture")
+    simulated = columns.values("simulated")
     out = []
     for residual, row in worst:
         picture = _thumbnail(folder / places[row] if places[row] else None, simulated[row] is not False, "after")
@@ -233,8 +239,10 @@ def _pictures(folder: Path, columns: Columns, shown: Sequence[Change]) -> str:
     """Return the earlier and the new picture of captures, side by side, with figures and messages."""
     out = []
     for one in shown:
-        place, messages = columns.words("picture")[one.row], columns.values("messages")[one.row]
-        before, simulated = columns.words("before_picture")[one.row], columns.values("simulated")[one.row] is not False
+        place = columns.words("picture")[one.row]
+        messages = columns.values("messages")[one.row]
+        before = columns.words("before_picture")[one.row]
+        simulated = columns.values("simulated")[one.row] is not False
         pair = _thumbnail(Path(before) if before else None, simulated, "before")
         pair += _thumbnail(folder / place if place else None, simulated, "after")
         notes = "; ".join(map(str, messages)) if isinstance(messages, list) else ""
@@ -288,11 +296,9 @@ def _causes(columns: Columns) -> str:
 
 def _drift(columns: Columns) -> str:
     """Return PSF consistency by device, and against the age of the calibration."""
-    scores, ages, devices = (
-        columns.numbers("quality_psf_score"),
-        columns.numbers("calibration_age_days"),
-        (columns.words("device")),
-    )
+    scores = columns.numbers("quality_psf_score")
+    ages = columns.numbers("calibration_age_days")
+    devices = columns.words("device")
     by_device: dict[str, list[float]] = defaultdict(list)
     points = []
     for score, age, device in zip(scores, ages, devices, strict=True):
@@ -320,7 +326,8 @@ def _retakes(columns: Columns) -> str:
 
 
 def _refraction(columns: Columns) -> str:
-    spheres, sds = columns.numbers("sphere_dpt"), columns.numbers("sphere_sd_dpt")
+    spheres = columns.numbers("sphere_dpt")
+    sds = columns.numbers("sphere_sd_dpt")
     known = [(sphere, sd) for sphere, sd in zip(spheres, sds, strict=True) if sphere is not None and sd is not None]
     if len(known) < 2:
         return "<p>Fewer than two captures have a refraction.</p>"

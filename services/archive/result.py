@@ -92,7 +92,8 @@ class ResultFolder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._results, self._quarantine = root / "results", root / QUARANTINE
+        self._results = root / "results"
+        self._quarantine = root / QUARANTINE
 
     @property
     def lock(self) -> Path:

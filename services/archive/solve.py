@@ -116,7 +116,8 @@ class Solvers:
     """Planned solvers of one worker by calibration and settings, and reconstruction with them. Not thread-safe."""
 
     def __init__(self, calibrations: CalibrationFiles, clock: Clock | None = None) -> None:
-        self._calibrations, self._clock = calibrations, clock or SystemClock()
+        self._calibrations = calibrations
+        self._clock = clock or SystemClock()
         self._planner = Planner(None, effort=EFFORT)
         self._kept: OrderedDict[tuple[str, str], CaptureReconstructor] = OrderedDict()
 
@@ -125,7 +126,8 @@ class Solvers:
 
         The failure of a capture is part of the outcome. OSError only if the result cannot be written.
         """
-        begin_s, name = self._clock.now_s(), task.capture.result
+        begin_s = self._clock.now_s()
+        name = task.capture.result
         if results.has(name):
             return Outcome(name, 0.0)
         if found := different_versions(task.software, software()):
@@ -155,7 +157,8 @@ class Solvers:
 
     def _made(self, task: Task, spool: Path) -> "_Made | Quarantined":
         """Return the reconstruction of a capture, from copies of its files that have the planned digests."""
-        capture, name = task.capture, task.capture.result
+        capture = task.capture
+        name = task.capture.result
         try:
             frames = _copied_frames(capture, spool)
         except OSError as error:
@@ -196,7 +199,8 @@ class _Made:
 def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
     """Return copies of all frames of a capture, whose contents have the planned digests; errors as in `_copied`."""
     lit = [_copied(capture.raw, capture.raw_sha256, spool / "raw")]
-    colours, unusable = dict[Colour, list[Path]](), dict[int, str]()
+    colours = dict[Colour, list[Path]]()
+    unusable = dict[int, str]()
     for one in capture.frames:
         copy = _copied(one.path, one.sha256, spool / "raw")
         if one.colour:

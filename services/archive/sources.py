@@ -147,7 +147,8 @@ def _stored(store: Path, place: Path, calibrations: Mapping[str, Path], unusable
         return replace(found, refused=f"its record is damaged: {error.message}")
     if record is None:
         return replace(found, refused="it has no record; open the store once with this release")
-    content, digests = record.content, _digests(record.content.get("files"))
+    content = record.content
+    digests = _digests(record.content.get("files"))
     try:
         report = read_report(content.get("report"))
     except (ValueError, KeyError) as error:
@@ -258,7 +259,8 @@ def _of_dataset(folder: Path) -> Iterator[FoundCapture]:
     images = {folder: _images(folder) for folder in {one.raw.parent for one in dataset.entries}}
     groups = {folder: _grouped(found) for folder, found in images.items()} if own_layout else {}
     for entry in dataset.entries:
-        place, stem = entry.raw.parent, entry.raw.stem
+        place = entry.raw.parent
+        stem = entry.raw.stem
         if own_layout and stem not in groups[place]:
             continue  # a further frame of another entry
         found = _of_entry(folder, entry, dataset.layout.aligned or dataset.layout.name == "pairs")

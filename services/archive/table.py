@@ -36,7 +36,11 @@ QUALITY = (
     "psf_orientation",
     "psf_mirrored",
 )
-TEXT, NUMBER, COUNT, FLAG, TEXTS = pa.string(), pa.float64(), pa.int64(), pa.bool_(), pa.list_(pa.string())
+TEXT = pa.string()
+NUMBER = pa.float64()
+COUNT = pa.int64()
+FLAG = pa.bool_()
+TEXTS = pa.list_(pa.string())
 BEFORE = {
     "before_picture": TEXT,
     "before_method": TEXT,
@@ -116,7 +120,8 @@ def write_table(plan: Plan, results: ResultFolder) -> None:
 
 def encoded_table(rows: Iterable[Row]) -> bytes:
     """Return rows with the columns of SCHEMA as a Parquet file, ROWS_PER_GROUP in memory at once."""
-    out, waiting = BytesIO(), iter(rows)
+    out = BytesIO()
+    waiting = iter(rows)
     with parquet.ParquetWriter(out, SCHEMA, compression="zstd") as writer:
         while group := list(islice(waiting, ROWS_PER_GROUP)):
             writer.write_table(pa.Table.from_pylist(group, SCHEMA))
@@ -166,9 +171,11 @@ def _failed_columns(failure: Quarantined | None) -> Row:
 
 def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     """Return the columns of a stored result."""
-    document, run = stored.report, stored.run
+    document = stored.report
+    run = stored.run
     report, raw, scores = (_object(document.get(key)) for key in ("report", "raw", "scores"))
-    quality, dpt = _object(report.get("quality")), _object(report.get("refraction_dpt"))
+    quality = _object(report.get("quality"))
+    dpt = _object(report.get("refraction_dpt"))
     seconds = _object(run.get("seconds"))
     same = ("method", "bin", "rounds", "stopped", "psf_index", "psf_scale", "noise_dn", "residual")
     place = results.place(name)
@@ -201,7 +208,8 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
 
 def _frame_columns(report: Mapping[str, object]) -> Row:
     """Return how many frames were taken and used, and the colours that are measured, predicted and missing."""
-    frames, channels = _objects(report.get("frames")), _objects(report.get("channels"))
+    frames = _objects(report.get("frames"))
+    channels = _objects(report.get("channels"))
     taken = [one for one in channels if one.get("reason") is None]
     return {
         "frames": len(frames),

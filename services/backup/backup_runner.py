@@ -63,7 +63,8 @@ class BackupRunner:
         """Begin a backup to a folder, with the errors of `write_backup` in the state; Busy during another one."""
         with self._lock:
             self._refuse_busy()
-            self._progress, self._error = (0, 0), None
+            self._progress = (0, 0)
+            self._error = None
             self._thread = Thread(target=self._run, args=(place,), name="backup", daemon=True)
             self._thread.start()
 
@@ -90,7 +91,8 @@ class BackupRunner:
             error = problem
         finally:
             with self._lock:
-                self._progress, self._error = None, error
+                self._progress = None
+                self._error = error
 
     def _report(self, done: int, total: int) -> None:
         """Store the progress, and wait until the exam is idle; StoreError if the program ends."""

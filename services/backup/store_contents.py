@@ -39,7 +39,8 @@ def fingerprint(store: Path, unit: str) -> bytes:
     The record of a capture has the SHA-256 of each of its files, so that they need not be read; otherwise it is the
     content of every file.
     """
-    digest, folder = hashlib.sha256(unit.encode()), store / unit
+    digest = hashlib.sha256(unit.encode())
+    folder = store / unit
     has_record = (folder / CAPTURE_RECORD).exists()
     for path in _files_below(folder):
         digest.update(f"\0{path.relative_to(folder)}\0{path.stat().st_size}\0".encode())
@@ -78,7 +79,8 @@ def packed(files: Mapping[str, Path | bytes]) -> bytes:
         for name, source in files.items():
             entry = tarfile.TarInfo(name)
             content = source if isinstance(source, bytes) else blobs.read_blob(source)
-            entry.mode, entry.size = atomic_io.PRIVATE_FILE, len(content)
+            entry.mode = atomic_io.PRIVATE_FILE
+            entry.size = len(content)
             archive.addfile(entry, io.BytesIO(content))
     return out.getvalue()
 

@@ -76,7 +76,10 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     """
     made_at = clock.wall()
     database = store_contents.database_copy(store / schema.DATABASE)
-    paths, objects, unreadable, written_bytes = store_contents.units(store), dict[str, str](), list[str](), 0
+    paths = store_contents.units(store)
+    objects = dict[str, str]()
+    unreadable = list[str]()
+    written_bytes = 0
     for done, unit in enumerate(paths):
         progress(done, len(paths))
         try:

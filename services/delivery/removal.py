@@ -12,7 +12,7 @@ from services.records.upload_queue import UploadQueue
 from services.records.visit import Visit
 from services.records.visit_repository import VisitRepository
 
-MOST_VISITS = 100_000  # more than a card holds
+MAX_VISITS = 100_000  # more than a card holds
 
 
 def reason_to_remove(visit: Visit, sent: Collection[str], exported_state: datetime | None) -> Reason | None:
@@ -45,14 +45,16 @@ class PictureRemoval:
 
     def __init__(self, store: CaptureStore, visits: VisitRepository, clock: Clock) -> None:
         self._store, self._visits, self._clock = store, visits, clock
-        self._queue, self._exports = UploadQueue(store.engine, clock), ExportRecords(store.folder)
+        self._queue = UploadQueue(store.engine, clock)
+        self._exports = ExportRecords(store.folder)
 
     def removable(self) -> Removable:
         """Return what may be removed now. StoreError if the database cannot be read."""
         sent = self._queue.sent_visits()
         found: dict[Reason, list[str]] = {"exported": [], "sent": []}
-        days, size_bytes = list[str](), 0
-        for visit in self._visits.visits(MOST_VISITS, open=False):
+        days = list[str]()
+        size_bytes = 0
+        for visit in self._visits.visits(MAX_VISITS, open=False):
             reason = reason_to_remove(visit, sent, self._exports.exported_state(visit.id))
             ids = [one.capture for slot in visit.slots.values() for one in slot.captures]
             sizes = {id: size for id in ids if (size := self._store.removed.removable_bytes(id))}

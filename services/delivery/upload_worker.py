@@ -71,7 +71,8 @@ class UploadWorker:
             clock,
             random_share,
         )
-        self._failures, self._due_s = 0, 0.0
+        self._failures = 0
+        self._due_s = 0.0
         self._worker = PeriodicWorker("sending", self.step, POLL_S, "upload queue not readable")
 
     def begin(self) -> None:
@@ -87,7 +88,8 @@ class UploadWorker:
     def retry_now(self, visit: str | None = None) -> None:
         """Clear the errors of one visit (None: of all), reset the backoff and try at once."""
         self.queue.clear_errors(visit)
-        self._failures, self._due_s = 0, 0.0
+        self._failures = 0
+        self._due_s = 0.0
         self._worker.wake()
 
     @property

@@ -33,7 +33,8 @@ from services.records.upload_queue import UploadReceipt
 
 CHUNK_BYTES = 1 << 16
 MAX_BODY_BYTES = 1 << 16
-SUCCESS, PRECONDITION_FAILED = (200, 201, 204), 412
+SUCCESS = (200, 201, 204)
+PRECONDITION_FAILED = 412
 RETRYABLE = (408, 425, 429)
 
 
@@ -245,7 +246,9 @@ class _ReceiverConnection(HTTPConnection):
         host = settings.split_address.hostname or ""
         self.default_port = 443 if tls_context else 80
         super().__init__(host, settings.split_address.port or self.default_port, timeout=settings.answer_s)
-        self._tls_context, self._through, self._answer_s = tls_context, settings.through, settings.answer_s
+        self._tls_context = tls_context
+        self._through = settings.through
+        self._answer_s = settings.answer_s
 
     def connect(self) -> None:
         if self._through is not None:

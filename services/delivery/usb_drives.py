@@ -80,7 +80,8 @@ def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
     still there. Errors: UsbDriveFull, UsbDriveUnavailable.
     """
     with drive_errors(drive):
-        target, number = drive / name, 1
+        target = drive / name
+        number = 1
         while target.exists():
             number += 1
             target = drive / f"{name}-{number}"

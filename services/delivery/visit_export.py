@@ -75,7 +75,8 @@ def _picture(store: CaptureStore, id: str, name: str) -> bytes:
 
     For a capture that was moved to the other eye, return the same pixels with the corrected eye in the note.
     """
-    capture, stored = store.get(id), store.read(id, name)
+    capture = store.get(id)
+    stored = store.read(id, name)
     if not capture.report.moved:
         return stored
     return with_note(stored, f"{capture.eye} {capture.taken_at:%Y-%m-%d}")
@@ -83,7 +84,8 @@ def _picture(store: CaptureStore, id: str, name: str) -> bytes:
 
 def _report(store: CaptureStore, id: str) -> bytes:
     """Return the stored report (JSON); for a capture that was moved to the other eye, with its new eye and slot."""
-    capture, stored = store.get(id), store.read(id, "report.json")
+    capture = store.get(id)
+    stored = store.read(id, "report.json")
     if not capture.report.moved:
         return stored
     report = report_as_json(capture.report)
@@ -101,7 +103,8 @@ def zip_archive(name: str, files: Mapping[str, bytes], begun_at: datetime) -> by
 
     Each entry is dated `begun_at`, so equal files give an equal archive; dates before 1980 become 1980.
     """
-    out, dated = io.BytesIO(), max(begun_at.timetuple()[:6], EARLIEST_ZIP_DATE)
+    out = io.BytesIO()
+    dated = max(begun_at.timetuple()[:6], EARLIEST_ZIP_DATE)
     with zipfile.ZipFile(out, "w") as archive:
         for path, content in files.items():
             archive.writestr(zipfile.ZipInfo(f"{name}/{path}", dated), content)

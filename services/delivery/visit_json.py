@@ -7,7 +7,8 @@ from services.records.visit import SlotState, Visit
 
 def visit_as_json(visit: Visit) -> dict[str, JsonValue]:
     """Return a visit as a JSON object, with identifying fields; timestamps are ISO 8601."""
-    finished, ending = visit.finished_at, visit.outcome
+    finished = visit.finished_at
+    ending = visit.outcome
     fields: dict[str, JsonValue] = {
         name: [*value] if isinstance(value, list) else value for name, value in visit.fields.items()
     }

@@ -55,7 +55,8 @@ class AlertMonitor:
     def __init__(self, sources: AlertSources, clock: Clock, publish: Publish) -> None:
         self._sources, self._clock, self._publish = sources, clock, publish
         self._began = (clock.wall(), clock.now_s())
-        self._cooling, self._holder = CoolingTimer(), sources.lease_holder()
+        self._cooling = CoolingTimer()
+        self._holder = sources.lease_holder()
         self._published: dict[AlertCode, Alert] = {}
         self._lock = Lock()
         self._worker = PeriodicWorker("notices", self.publish_changes, POLL_S, "alerts not readable")
@@ -99,14 +100,16 @@ class AlertMonitor:
         return False
 
     def _of_space(self) -> Iterator[Alert]:
-        store, slots = self._sources.store, self._sources.visits.protocol.slots
+        store = self._sources.store
+        slots = self._sources.visits.protocol.slots
         if isinstance(store.refusal, StoreReadOnly):  # the problem of the next live picture says so
             return iter(())
         return alerts.space_alerts(store.space.captures_left(), store.space.visits_left(len(slots)))
 
     def _of_instrument(self) -> Iterator[Alert]:
         status = self._sources.read_status()
-        head_c, charge_ratio = status.head_c, status.battery  # an error of a reading is reported by the health checks
+        head_c = status.head_c  # an error of a reading is reported by the health checks
+        charge_ratio = status.battery
         if head_c is not None and not isinstance(head_c, DiffuscopeError):
             yield from alerts.heat_alerts(head_c, status.warmest_c, self._cooling, self._clock.now_s())
         if charge_ratio is not None and not isinstance(charge_ratio, DiffuscopeError):
@@ -115,7 +118,8 @@ class AlertMonitor:
         yield from alerts.lateness_alerts(status.late_s)
 
     def _of_date(self) -> Iterator[Alert]:
-        now, now_s = self._clock.wall(), self._clock.now_s()
+        now = self._clock.wall()
+        now_s = self._clock.now_s()
         drift_s = (now - self._began[0]).total_seconds() - (now_s - self._began[1])
         return alerts.date_alerts(now, self._newest(), drift_s, clock_state() in ("network", "browser"))
 

@@ -92,7 +92,8 @@ def camera(facts: StatusSnapshot) -> Check:
     """Check that no problem prevents captures and that the instrument has started; fails during a calibration too."""
     value, remedy = "open", ""
     if facts.problem is not None:
-        value, remedy = facts.problem.message, facts.problem.remedy
+        value = facts.problem.message
+        remedy = facts.problem.remedy
     elif facts.state == "starting":
         value, remedy = "getting ready", "The instrument is getting ready. Wait a minute."
     return Check("camera", not remedy, value, "open, and nothing wrong", remedy, of_release=True)
@@ -120,7 +121,8 @@ def captures(facts: StatusSnapshot) -> Check:
     limit = "can be written and read"
     if facts.store is not None:
         return _result(facts.store, "captures", "", limit, of_release=True)
-    problems, remedies = [], []
+    problems = []
+    remedies = []
     if facts.orphans:
         many = _count(facts.orphans, "capture is", "captures are")
         problems.append(f"{many} on the disk without an entry in the database")
@@ -163,11 +165,13 @@ def space(facts: StatusSnapshot) -> Check:
     Free bytes and free files (inodes) count. Quarantined captures count as free space; their number and size are in the
     value.
     """
-    people, torn = facts.people_left, facts.torn_bytes
+    people = facts.people_left
+    torn = facts.torn_bytes
     value = f"plenty, more than {MAX_SHOWN_VISITS} people" if thresholds.are_many_visits(people) else f"{people} people"
     if torn:
         value += f"; half-kept pictures aside: {len(torn)}, {math.ceil(sum(torn) / 1e6)} MB"
-    ok, remedy = not thresholds.are_few_visits(people), "Copy captures away and make room."
+    ok = not thresholds.are_few_visits(people)
+    remedy = "Copy captures away and make room."
     if not ok and facts.lacks_files:
         value, remedy = f"{value}; the disk takes few more files", NO_FILES_REMEDY
     return Check("space", ok, value, f"at least {MIN_VISITS_LEFT}", remedy)
@@ -209,8 +213,10 @@ def clock(facts: StatusSnapshot) -> Check:
     """
     earliest = thresholds.earliest_date(facts.newest)
     how = CLOCK_WORDS[facts.clock]
-    value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
-    ok, remedy = not thresholds.is_date_wrong(facts.now, facts.newest), "Set date and time before the next picture."
+    value = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}"
+    limit = f"not before {earliest:%Y-%m-%d %H:%M}"
+    ok = not thresholds.is_date_wrong(facts.now, facts.newest)
+    remedy = "Set date and time before the next picture."
     return Check("clock", ok, value, limit, remedy, known=facts.clock != "not_set" or not ok)
 
 
@@ -231,7 +237,9 @@ def speed(facts: StatusSnapshot) -> Check:
     if not facts.presses:
         return Check("speed", True, "no pictures yet", limit, "", known=False)
     took_s, late_s = (sorted(column) for column in zip(*facts.presses, strict=True))
-    p50_s, p99_s, p99_late_s = _percentile(took_s, 0.5), _percentile(took_s, 0.99), _percentile(late_s, 0.99)
+    p50_s = _percentile(took_s, 0.5)
+    p99_s = _percentile(took_s, 0.99)
+    p99_late_s = _percentile(late_s, 0.99)
     value = f"half of {len(took_s)} pictures within {p50_s:.1f} s, 99 of 100 within {p99_s:.1f} s"
     if p99_late_s > 0:
         value += f", {p99_late_s:.1f} s over"
@@ -272,7 +280,7 @@ BLUE_LIGHT = (
 def light_limits(facts: StatusSnapshot) -> Check:
     """Check that the light limits were compared with the purchased standard; ok but not known if not.
 
-    At most half of a limit that was not compared is used (`MOST_UNCHECKED_SHARE` in device/light_safety/hazard.py).
+    At most half of a limit that was not compared is used (`MAX_UNCHECKED_SHARE` in device/light_safety/hazard.py).
     """
     limit = "each compared with the standard"
     blue = BLUE_LIGHT if facts.takes_blue_light else ""

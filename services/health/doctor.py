@@ -172,7 +172,10 @@ def _nodes(spec: InstrumentSpec | None) -> list[tuple[str, NodeKind]]:
     """Return the device files of a head with their kinds; without a head those of the header's first buses."""
     if spec is None:
         return [("/dev/spidev0.0", SPI), ("/dev/i2c-1", I2C), ("/dev/gpiochip0", GPIO)]
-    light, bus, gpio, found = spec.light, spec.bus, spec.gpio, list[tuple[str, NodeKind]]()
+    light = spec.light
+    bus = spec.bus
+    gpio = spec.gpio
+    found = list[tuple[str, NodeKind]]()
     if light.backend == "apa102" and light.chain is not None:
         found.append((light.chain.device, SPI))
     if light.backend == "tlc5971" and light.sinks is not None:

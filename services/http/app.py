@@ -76,16 +76,20 @@ def create_app(
     the technician's login. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
     """
-    store, clock = arbiter.context.store, arbiter.context.clock
-    visits, lease = VisitRepository(store.engine, protocol or load_protocol(), clock), ControlLease(clock)
-    queue, pack = UploadQueue(store.engine, clock), archive_builder(store, visits)
+    store = arbiter.context.store
+    clock = arbiter.context.clock
+    visits = VisitRepository(store.engine, protocol or load_protocol(), clock)
+    lease = ControlLease(clock)
+    queue = UploadQueue(store.engine, clock)
+    pack = archive_builder(store, visits)
     worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
     alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue)
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
     app = _http_application(life, own_host_names() if host_names is None else host_names)
-    pending, controlled = PendingCaptures(), [Depends(acquire_control_lease(lease))]
+    pending = PendingCaptures()
+    controlled = [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
     app.include_router(captures_router(store, arbiter))
     app.include_router(visits_router(visits, lease, pending, checkpoints.request), dependencies=controlled)

@@ -114,7 +114,8 @@ class PinAuthenticator:
             raise LoginRequired("the technician's place is locked")
 
     def _issue_token(self) -> str:
-        self._wrong, self._not_before_s = 0, 0.0
+        self._wrong = 0
+        self._not_before_s = 0.0
         self._token, self._touched_s = secrets.token_urlsafe(32), self._clock.now_s()
         return self._token
 

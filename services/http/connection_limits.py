@@ -198,7 +198,8 @@ class LimitedProtocol(H11Protocol):
 
     def is_overdue(self, now_s: float) -> bool:
         """Return whether a time-out of header, body or answer is over."""
-        limits, waited_s = self._table.limits, now_s - self._phase_since_s
+        limits = self._table.limits
+        waited_s = now_s - self._phase_since_s
         if self._note_sending(now_s):
             return now_s - self._sent_since_s > limits.send_timeout_s
         if self._phase is h11.IDLE:

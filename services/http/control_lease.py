@@ -26,8 +26,10 @@ class ControlLease:
     """
 
     def __init__(self, clock: Clock) -> None:
-        self._clock, self._lock = clock, Lock()
-        self._key, self._until_s = "", 0.0
+        self._clock = clock
+        self._lock = Lock()
+        self._key = ""
+        self._until_s = 0.0
 
     @property
     def holder(self) -> str | None:

@@ -6,7 +6,8 @@ from threading import Lock
 from device.clock import Clock
 
 LOGGER_NAMES = ("asyncio", "uvicorn.error")
-RECORDS, INTERVAL_S = 30, 60.0
+RECORDS = 30
+INTERVAL_S = 60.0
 
 
 class LogRateLimit(logging.Filter):
@@ -26,10 +27,13 @@ class LogRateLimit(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether the record is logged."""
         with self._lock:
-            now_s, suppressed = self._clock.now_s(), 0
+            now_s = self._clock.now_s()
+            suppressed = 0
             if now_s - self._begin_s >= self._interval_s:
-                suppressed, self._suppressed = self._suppressed, 0
-                self._begin_s, self._passed = now_s, 0
+                suppressed = self._suppressed
+                self._suppressed = 0
+                self._begin_s = now_s
+                self._passed = 0
             self._passed += 1
             if self._passed > self._records:
                 self._suppressed += 1

@@ -42,7 +42,9 @@ class CrossOriginProtection:
     """
 
     def __init__(self, app: ASGIApp, names: tuple[str, ...], answer: ErrorResponse) -> None:
-        self.app, self.names, self.answer = app, frozenset(name.lower() for name in names), answer
+        self.app = app
+        self.names = frozenset(name.lower() for name in names)
+        self.answer = answer
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a permitted ASGI request to the application; answer a refused one with its error."""
@@ -51,7 +53,8 @@ class CrossOriginProtection:
 
     def _error(self, scope: Scope) -> DiffuscopeError | None:
         headers = Headers(scope=scope)
-        host, origin = headers.get("host"), headers.get("origin")
+        host = headers.get("host")
+        origin = headers.get("origin")
         if host is not None and not is_trusted_host(host, self.names):
             return UntrustedHost(f"{host[:80]!r} is not a name of this camera")
         if scope["method"] not in SAFE_METHODS and origin is not None and _authority(origin) != (host or "").lower():
@@ -168,7 +171,8 @@ class HeadRequests:
         if scope["path"] in LIGHT_EMITTING_PATHS:
             await Response(status_code=204)(scope, receive, send)
             return
-        answered, is_asked = asyncio.Event(), False
+        answered = asyncio.Event()
+        is_asked = False
 
         async def receive_nothing() -> Message:
             nonlocal is_asked

@@ -254,7 +254,8 @@ class Server(uvicorn.Server):
 
     def __init__(self, config: LimitedConfig, event_bus: EventBus) -> None:
         super().__init__(config)
-        self._connections, self._event_bus = config.connections, event_bus
+        self._connections = config.connections
+        self._event_bus = event_bus
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -8,7 +8,8 @@ from services.identity.apply_settings import CardBoot
 from services.identity.provision import load_or_create_identity
 
 if __name__ == "__main__":
-    computer, clock = Computer(), SystemClock()
+    computer = Computer()
+    clock = SystemClock()
     identity = load_or_create_identity(computer.data / "identity", computer.serial(), clock)
     computer.apply_identity(identity, clock)
     if (problem := CardBoot().run()) is not None:

@@ -64,7 +64,8 @@ class CardBoot:
         return next((one for one in problems if one is not None), None)
 
     def _apply_head_and_programme(self, settings: CardSettings) -> None:
-        output, arguments = self.root / OUTPUT, {}
+        output = self.root / OUTPUT
+        arguments = {}
         for name in named_files(settings, self.kept):
             self._write_public(name, (self.kept / name).read_bytes())
         if settings.head is not None:

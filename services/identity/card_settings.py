@@ -166,7 +166,8 @@ def named_files(settings: CardSettings, folder: Path) -> list[str]:
 
     A head file names a sensor, or the head whose light it has. SpecError for a file that cannot be read.
     """
-    named, pending = set[str](), [settings.programme, settings.head]
+    named = set[str]()
+    pending = [settings.programme, settings.head]
     while pending:
         name = pending.pop()
         if name is None or name in named or Path(name).name != name or not name.endswith(".toml"):

@@ -17,7 +17,8 @@ SHARED_HOST_NAME = "diffuscope.local"  # published by avahi on every device
 ACCESS_POINT_ADDRESS = IPv4Address("10.42.0.1")  # of the access point: NetworkManager's default
 NETWORKS = (IPv4Network("10.42.0.0/24"), IPv4Network("127.0.0.0/8"))
 # The clock at the first boot may be years wrong: the authority's validity does not depend on it.
-AUTHORITY_BEGIN, AUTHORITY_END = datetime(2020, 1, 1, tzinfo=UTC), datetime(2060, 1, 1, tzinfo=UTC)
+AUTHORITY_BEGIN = datetime(2020, 1, 1, tzinfo=UTC)
+AUTHORITY_END = datetime(2060, 1, 1, tzinfo=UTC)
 SERVER_CERTIFICATE_DAYS = 390  # validity of a server certificate; browsers refuse more than 825 days
 
 

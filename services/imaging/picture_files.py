@@ -51,7 +51,8 @@ def to_png(
     chunk `predicted`. Raises FrameError if any value is NaN or infinite.
     """
     _refuse_invalid_picture(picture)
-    pixels, texts = _display_pixels(picture, window), {}
+    pixels = _display_pixels(picture, window)
+    texts = {}
     if predicted:
         texts = {_PREDICTED_TEXT: ", ".join(predicted)}
         pixels = with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, at_right=True)
@@ -119,7 +120,8 @@ def read_raw_tiff(data: bytes) -> tuple[Counts, RawMetadata]:
     try:
         with tifffile.TiffFile(BytesIO(data)) as tiff:
             page = tiff.pages.first
-            counts, description = page.asarray(), json.loads(page.description)
+            counts = page.asarray()
+            description = json.loads(page.description)
     except (*_BROKEN_TIFF, ValueError, OSError, LookupError) as error:
         raise FrameError(f"this is not a whole raw TIFF: {error}") from error
     if counts.dtype != np.uint16 or not isinstance(description, dict):
@@ -158,7 +160,8 @@ def display_window(picture: Image) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(lit, (_LOW, _HIGH)))
     if high - low <= 1e-6 * max(abs(low), abs(high)):  # uniform grey: the window includes zero
-        low, high = min(low, 0.0), max(high, 0.0)
+        low = min(low, 0.0)
+        high = max(high, 0.0)
     return low, high
 
 

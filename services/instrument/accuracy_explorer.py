@@ -186,7 +186,8 @@ def simulated_head(spec: InstrumentSpec, scene: InstrumentSpec) -> InstrumentSpe
 
 
 def _reconstruct(kept: StoredCapture, recipe: Recipe, plans: Path, report: Callable[[str], None]) -> bytes:
-    (counts, _), (dark, _) = picture_files.read_raw_tiff(kept.raw_tiff), picture_files.read_raw_tiff(kept.dark_tiff)
+    (counts, _) = picture_files.read_raw_tiff(kept.raw_tiff)
+    (dark, _) = picture_files.read_raw_tiff(kept.dark_tiff)
     shape = (counts.shape[0], counts.shape[1])
     report("making plans")
     steps = (recipe,)

@@ -140,7 +140,8 @@ class CalibrationMonitor:
 
     def forget_results(self) -> None:
         """Forget the results of all checks; queued captures stay queued."""
-        self._sights, self._refractions = (), ()
+        self._sights = ()
+        self._refractions = ()
 
     def _publish_changes(self) -> None:
         """Publish the findings when the set of failed ones has changed."""

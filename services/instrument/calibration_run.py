@@ -100,7 +100,8 @@ class CalibrationRun:
             raise error  # the exam can own the head again
 
     def _measure(self, request: CalibrationRequest) -> StoredCalibration:
-        parts, bench = self._parts, self._bench
+        parts = self._parts
+        bench = self._bench
         operator = Operator(self._request_stand, log.info, self._state.show_figures)
         job = calibration_job(bench, parts.spec, request, log.info)
         work = parts.archive.root / STEPS_FOLDER

@@ -16,7 +16,8 @@ WANTED_S = 3.0  # pictures are made this long after the last request
 EVERY_S = 0.2
 LONGEST_SIDE_PX = 960
 DIM, FULL = 0.3, 0.95  # share of the ADC range: outside it, `take_preview` changes the exposure
-SHORTEST_S, LONGEST = 1e-3, 4  # the longest as a multiple of the exposure of a capture
+SHORTEST_S = 1e-3  # the longest as a multiple of the exposure of a capture
+LONGEST = 4
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,16 @@ class CameraTap:
         """
         self.prepare(ExposureSettings(exposure_s))
         frame = self.expose(ExposureSettings(exposure_s))
-        black_dn, white_dn = self._spec.black_dn, self._spec.white_dn
+        black_dn = self._spec.black_dn
+        white_dn = self._spec.white_dn
         share = (_brightest_dn(frame.counts) - black_dn) / (white_dn - black_dn)
         if share > FULL:
             return max(exposure_s / 2, SHORTEST_S)
         return min(exposure_s * 2, LONGEST * self._spec.exposure_s) if share < DIM else exposure_s
 
     def _publish(self, frame: Frame, now_s: float) -> None:
-        counts, white_dn = frame.counts, self._spec.white_dn
+        counts = frame.counts
+        white_dn = self._spec.white_dn
         jpeg = counts_jpeg(counts, self._spec.black_dn, white_dn, LONGEST_SIDE_PX, frame.simulated)
         levels = _brightest_dn(counts), float(counts.mean()), float(np.mean(counts >= white_dn))
         with self._condition:

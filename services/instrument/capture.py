@@ -140,7 +140,9 @@ class IdempotencyKeys:
 
 def frame_metadata(capture: RawMetadata, frame: Frame) -> RawMetadata:
     """Return the metadata of a raw frame; `capture`: those of all frames of its capture."""
-    exposure_s, light, simulated = frame.exposure_s, frame.illumination, frame.simulated
+    exposure_s = frame.exposure_s
+    light = frame.illumination
+    simulated = frame.simulated
     return replace(capture, exposure_s=exposure_s, illumination=light, simulated=simulated)
 
 
@@ -166,7 +168,8 @@ def capture_files(
     """
     note = f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
     green = picture_files.to_jpeg(shown, THUMBNAIL_PX, capture.simulated)
-    thumbnail, coloured = green, dict[str, FileContent]()
+    thumbnail = green
+    coloured = dict[str, FileContent]()
     predicted = [one.name for one in capture.report.reconstruction.channels if one.predicted]
     if colour is not None:
         colour = render_colour(colour)

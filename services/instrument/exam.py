@@ -53,7 +53,9 @@ class ExamService:
         budget_s: Callable[[], float] = lambda: BUDGET_S,
         resumed_target: ResumedTarget = refuse_targets,
     ) -> None:
-        self.head, self.store, self.ready = head, store, Event()
+        self.head = head
+        self.store = store
+        self.ready = Event()
         self._watchdog = watchdog
         self._requests = requests = ExamRequests(clock)
         self.progress = Progress(clock, (FRAMES + 1) * head.spec.camera.exposure_s, budget_s)

@@ -57,7 +57,8 @@ class ExamEvents:
         With `is_exposing` it remains in its stage: the next frames are being exposed. The thread of the preparation
         calls this then, while the thread `head` publishes nothing.
         """
-        jpeg, before = picture_files.to_jpeg(look, THUMBNAIL_PX, simulated), self.output.quick_looks.get(id)
+        jpeg = picture_files.to_jpeg(look, THUMBNAIL_PX, simulated)
+        before = self.output.quick_looks.get(id)
         # Where the first frame is not the reference the page has the look of another frame: a new URL replaces it.
         url = f"/api/captures/{id}/quick.jpg" + ("" if before in (None, jpeg) else "?reference")
         self._show_quick_looks({**self.output.quick_looks, id: jpeg})

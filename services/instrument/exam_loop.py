@@ -73,7 +73,9 @@ class ExamLoop:
     """
 
     def __init__(self, parts: ExamParts, pipeline: CapturePipeline) -> None:
-        self._parts, self._requests, self._events = parts, parts.requests, parts.events
+        self._parts = parts
+        self._requests = parts.requests
+        self._events = parts.events
         self._pipeline = pipeline
         self._live = LivePictures(
             parts.head.light, parts.clock, pipeline, parts.requests, parts.events, parts.store.refuse_light_in_vain
@@ -131,7 +133,8 @@ class ExamLoop:
         self._events.state()
 
     def _expose(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
-        head, target = self._parts.head, press.target
+        head = self._parts.head
+        target = press.target
         target.permit()  # again: the consent may have been withdrawn while the press waited
         self._parts.store.refuse_light_in_vain()
         entry = press.journal_entry(id)
@@ -177,7 +180,8 @@ class ExamLoop:
     def _resume_oldest(self) -> None:
         """Queue the oldest press of the run before for reconstruction, with the frames that are on the disk."""
         resumed = self._resumed.popleft()
-        press, id = resumed.press, resumed.id
+        press = resumed.press
+        id = resumed.id
         self._requests.advance(ExamEvent.RESUMED)
         self._events.state()
         with self._resolving(press, id, ExamEvent.FAILED):
@@ -185,7 +189,9 @@ class ExamLoop:
             log.info("an interrupted capture is reconstructed", extra={"about": id})
 
     def _resume(self, resumed: ResumedPress) -> ExposedCapture:
-        press, id, journal = resumed.press, resumed.id, self._parts.capture_journal
+        press = resumed.press
+        id = resumed.id
+        journal = self._parts.capture_journal
         try:
             press.target.permit()  # the consent may have been withdrawn since
         except RequestRefused:
@@ -247,7 +253,8 @@ class ExamLoop:
         record = self._pipeline.record(shot, made, verdict, budget_s)
         self._events.stage(shot.press, shot.id, "keep")
         target = shot.press.target
-        files, deadline = record.files(), Deadline.after(self._parts.clock, LOCK_PATIENCE_S)
+        files = record.files()
+        deadline = Deadline.after(self._parts.clock, LOCK_PATIENCE_S)
         kept = _when_unlocked(
             lambda: self._parts.store.save(record.capture, files, target.write_rows, target.request),
             lambda: self._serve_between_rounds(shot),
@@ -255,7 +262,8 @@ class ExamLoop:
             self._events.problem,
         )
         self._events.kept(shot.id)
-        took_s, method = kept.report.total_s, made.report.method
+        took_s = kept.report.total_s
+        method = made.report.method
         log.info("a picture was kept after %.1f s, made by %s", took_s, method, extra={"about": shot.id})
         self._parts.calibration_monitor.add(kept)
         return kept

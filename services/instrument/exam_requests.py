@@ -145,7 +145,8 @@ class ExamRequests:
     def take_press(self) -> Press:
         """Return the waiting press, whose exposure begins; aiming is over, live pictures need a new request."""
         with self._lock:
-            press, self._pending = self._pending, None
+            press = self._pending
+            self._pending = None
             self._advance(ExamEvent.EXPOSE)
             self._change(replace(self._snapshot, live_until_s=0.0))  # aiming is over
         assert press is not None
@@ -173,7 +174,8 @@ class ExamRequests:
         """End the exam; return the press that waits, if any, for the caller to fail."""
         with self._lock:
             self._advance(ExamEvent.END)
-            press, self._pending = self._pending, None
+            press = self._pending
+            self._pending = None
         return press
 
     # The caller holds the lock

@@ -29,7 +29,9 @@ class FrameAssessor:
     ) -> None:
         self._frame_assessor = FrameQualityGate(calibration, shape, planner, index)
         self._aimer = AimingGuide(camera.exposure_s, self._frame_assessor.deg_per_sample)
-        self._geometry, self._field_deg, self._upright = calibration.geometry, calibration.field_deg, camera.upright
+        self._geometry = calibration.geometry
+        self._field_deg = calibration.field_deg
+        self._upright = camera.upright
 
     def aim(self, counts: Pixels, exposed_s: float) -> Aim:
         """Return the aiming hint after one more live frame, exposed at `exposed_s` (clock seconds)."""

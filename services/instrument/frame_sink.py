@@ -13,7 +13,10 @@ class FrameSink:
     """
 
     def __init__(self, writer: FrameWriter, shared: RawMetadata, colour: Colour) -> None:
-        self._writer, self._shared, self._colour, self._lit_frames = writer, shared, colour, 0
+        self._writer = writer
+        self._shared = shared
+        self._colour = colour
+        self._lit_frames = 0
 
     def __call__(self, frame: Frame, dose_j_per_cm2: float, exposed_s: float) -> None:
         """Begin to write a frame of the press; the dose and the duration are those of the press until now."""

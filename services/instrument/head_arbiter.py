@@ -159,7 +159,8 @@ class HeadTransfer:
 
     def _release(self, exam: ExamService) -> None:
         """Publish that captures are refused, then wait until the exam has released the head."""
-        now, event_bus = self.owner, self._context.event_bus
+        now = self.owner
+        event_bus = self._context.event_bus
         problem = now.problem
         assert problem is not None
         event_bus.publish("state", state=now.state)
@@ -195,9 +196,13 @@ class HeadTransfer:
 
     def _begin(self) -> None:
         """Open the exam; without a valid calibration, begin a calibration run that waits for a request."""
-        session, exam, calibration_error = self.owner.session, None, self.owner.calibration_error
+        session = self.owner.session
+        exam = None
+        calibration_error = self.owner.calibration_error
         try:
-            exam, calibration_error, session = self._open_exam(), None, None
+            exam = self._open_exam()
+            calibration_error = None
+            session = None
         except (CalibrationError, HeadMismatch) as error:
             log.warning("calibration needed: %s", error)
             calibration_error = error
@@ -319,7 +324,8 @@ class HeadArbiter:
 
         While the exam does not own the head: None after NO_PREVIEW_S.
         """
-        exam, self._last_preview_s = self.owner.exam, self.context.clock.now_s()
+        exam = self.owner.exam
+        self._last_preview_s = self.context.clock.now_s()
         if exam is None:
             await asyncio.to_thread(self.context.clock.sleep, NO_PREVIEW_S)
             return None

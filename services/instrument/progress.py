@@ -59,7 +59,8 @@ class Progress:
 
     def finish(self, id: str, kept: bool) -> None:
         """Remove a capture; if it was stored and no other is in progress, add its durations to the estimate."""
-        now_s, reached_s = self._clock.now_s(), self._reached_s.pop(id, {})
+        now_s = self._clock.now_s()
+        reached_s = self._reached_s.pop(id, {})
         self._due_s.pop(id, None)
         self._update_oldest()
         if kept and not self._due_s:  # overlapping captures have no representative durations

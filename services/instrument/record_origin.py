@@ -16,8 +16,10 @@ class CaptureOrigin:
     """
 
     def __init__(self, head: Head, data: Path, root: Path = Path("/")) -> None:
-        self._device, self._root = read_device(data), root
-        self._head, self._calibration_id = head.spec.name, head.calibration.id
+        self._device = read_device(data)
+        self._root = root
+        self._head = head.spec.name
+        self._calibration_id = head.calibration.id
         self._calibrated_at = None if head.provenance is None else head.provenance.made_at.isoformat()
 
     def __call__(self) -> RecordOrigin | None:

@@ -64,7 +64,8 @@ def resumed_presses(journal: CaptureJournal, target_of: ResumedTarget) -> tuple[
     found = []
     for one in journal.resumable:
         try:
-            eye, target = one.press.eye, target_of(one)
+            eye = one.press.eye
+            target = target_of(one)
             if eye is None:
                 raise FrameError("the eye of the press is not known")
         except DiffuscopeError as error:

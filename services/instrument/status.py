@@ -21,10 +21,12 @@ DARK_POLL_S = 0.02
 
 def read_status(arbiter: HeadArbiter) -> InstrumentStatus:
     """Return the present status; during a calibration the head is not read, and its readings are None."""
-    head, exam = arbiter.head, arbiter.current_exam
+    head = arbiter.head
+    exam = arbiter.current_exam
     chips = head.chips if head is not None else Chips()
     bus = (head if head is not None else arbiter.context).spec.bus
-    battery, thermometer = chips.battery, chips.thermometer
+    battery = chips.battery
+    thermometer = chips.thermometer
     findings = arbiter.findings
     return InstrumentStatus(
         state=arbiter.state,
@@ -44,7 +46,8 @@ def wait_until_dark(arbiter: HeadArbiter) -> bool:
 
     During aiming the lamp is lit half of the time. True at once during a calibration.
     """
-    head, clock = arbiter.head, arbiter.context.clock
+    head = arbiter.head
+    clock = arbiter.context.clock
     begin_s = clock.now_s()
     while head is not None and head.light.illumination is not None:
         if clock.now_s() - begin_s > 2 * head.light.max_on_s:

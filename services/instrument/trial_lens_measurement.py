@@ -55,8 +55,10 @@ class LensCheck:
         self._head, self._archive, self._bench = head, archive, bench
         self._stored = archive.load(head.calibration.id)
         refuse_simulated_change(self._stored.calibration, is_simulated=head.kind == "simulated")
-        calibration, camera = head.calibration.for_colour(head.spec.light.colour), head.spec.camera
-        planner, shape = Planner(None, effort="FFTW_ESTIMATE"), (camera.rows, camera.cols)
+        calibration = head.calibration.for_colour(head.spec.light.colour)
+        camera = head.spec.camera
+        planner = Planner(None, effort="FFTW_ESTIMATE")
+        shape = (camera.rows, camera.cols)
         self._estimator = RefractionEstimator(calibration, shape, planner, 0)
 
     def present(self, lens: TrialLens) -> bool:
@@ -71,7 +73,8 @@ class LensCheck:
 
         The lamp is dark afterwards. Errors of the camera and the guarded light.
         """
-        head, estimator = self._head, self._estimator
+        head = self._head
+        estimator = self._estimator
         shot = ExposureSettings(head.spec.camera.exposure_s)
         head.camera.prepare(shot)
         dark = head.camera.expose(shot).counts.copy()
@@ -97,7 +100,8 @@ class LensCheck:
 
         After an error the calibration in force is the one before: those of `keep_offset`, BusFault of the memory.
         """
-        kept, memory = keep_offset(self._archive, self._stored, fit), self._head.chips.memory
+        kept = keep_offset(self._archive, self._stored, fit)
+        memory = self._head.chips.memory
         if memory is None:
             return kept
         try:

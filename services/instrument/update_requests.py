@@ -31,7 +31,7 @@ from services.update.ipc import (
     write_request,
 )
 
-MOST_BYTES = 2_000_000_000  # largest upload; a bundle has about 350 MB
+MAX_BYTES = 2_000_000_000  # largest upload; a bundle has about 350 MB
 PICKUP_TIMEOUT_S = 90.0  # for the updater to take a request, on a busy computer
 NO_UPDATER_REMEDY = "Updates are for the device. On another computer, put the new version in as its README says."
 
@@ -63,7 +63,10 @@ class BundleUpload:
     """Temporary file that receives an uploaded bundle; `publish` renames it once `length` bytes have arrived."""
 
     def __init__(self, part: Path, file: BinaryIO, length: int) -> None:
-        self._part, self._file, self._length, self._arrived = part, file, length, 0
+        self._part = part
+        self._file = file
+        self._length = length
+        self._arrived = 0
 
     def write(self, piece: bytes) -> None:
         """Append one chunk of the bundle."""
@@ -110,7 +113,8 @@ class UpdateRequests:
         """
         if self._state is None or not self.is_here:
             return UpdateStatus(here=False, runs=self._version, state="none")
-        entry, waits = read_state(self._state), self._is_waiting()
+        entry = read_state(self._state)
+        waits = self._is_waiting()
         state = "asked" if waits else stage_of(entry, self._version, self._boot)
         trouble = self._timeout_error or (None if state in ("asked", "committed") else entry.trouble)
         return UpdateStatus(
@@ -140,7 +144,8 @@ class UpdateRequests:
             write_request(requests, request)
         except OSError as error:
             raise UpdateFailed(f"the updater cannot be told: {error.strerror}") from error
-        self._requested_s, self._timeout_error = self._clock.now_s(), None
+        self._requested_s = self._clock.now_s()
+        self._timeout_error = None
 
     @contextmanager
     def receiving(self, length: int) -> Iterator[BundleUpload]:
@@ -152,7 +157,7 @@ class UpdateRequests:
         """
         state = self._refuse_elsewhere()[0]
         self._refuse_while_under_way()
-        if not 0 < length <= MOST_BYTES:
+        if not 0 < length <= MAX_BYTES:
             raise InputError(f"a file of {length} bytes is no update", "Choose the file whose name ends in .raucb.")
         if not self._receiving.acquire(blocking=False):
             raise UpdateBusy("another file is being sent")
@@ -198,7 +203,8 @@ class UpdateRequests:
     @staticmethod
     def _refuse_without_space(folder: Path, length_bytes: int) -> None:
         """Raise UpdateNoRoom without space for the bundle twice: the updater makes a protected copy."""
-        free, twice = atomic_io.free_bytes(folder), 2 * length_bytes
+        free = atomic_io.free_bytes(folder)
+        twice = 2 * length_bytes
         if not atomic_io.has_room(twice, free):
             raise UpdateNoRoom(f"{free} bytes are free, and {twice + atomic_io.RESERVE_BYTES} are needed")
 

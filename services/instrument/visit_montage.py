@@ -26,8 +26,8 @@ from services.records.visit import Visit
 log = logging.getLogger(__name__)
 
 PICTURE = "picture.png"
-MOST_KEPT = 16  # montages in memory, about 1 MB each
-MOST_WAITING = 8
+MAX_KEPT = 16  # montages in memory, about 1 MB each
+MAX_WAITING = 8
 POLL_S = 0.2
 
 MontageState = Literal["none", "computing", "joined", "apart", "failed"]
@@ -127,7 +127,7 @@ class MontageMaker:
         if self._is_closed:
             return
         self._waiting.setdefault(digest, pictures)
-        while len(self._waiting) > MOST_WAITING:  # the screen that asked for it asks again
+        while len(self._waiting) > MAX_WAITING:  # the screen that asked for it asks again
             self._waiting.popitem(last=False)
         if not self._is_busy:
             self._is_busy = True
@@ -154,7 +154,7 @@ class MontageMaker:
                 self._waiting.pop(digest, None)
                 if not self._is_closed:
                     self._kept[digest] = made
-                while len(self._kept) > MOST_KEPT:
+                while len(self._kept) > MAX_KEPT:
                     self._kept.popitem(last=False)
 
     def _computed(self, pictures: Sequence[VisitPicture]) -> JoinedPictures:

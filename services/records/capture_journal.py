@@ -76,7 +76,8 @@ class CaptureJournal:
         with storage_errors():
             atomic_io.make_folder(self._folder)
             paths = files_in(self._folder, "*.json")
-            found, self._keys = {path.stem: _read(path) for path in paths}, {path.stem: _key(path) for path in paths}
+            found = {path.stem: _read(path) for path in paths}
+            self._keys = {path.stem: _key(path) for path in paths}
         for id in [id for id in found if _is_kept(store, id)]:
             del found[id]
             self.end(id)
@@ -188,7 +189,8 @@ class CaptureJournal:
         None, and its frames are deleted, without a lit one, without a readable entry or after MAX_ATTEMPTS.
         """
         folder = self._folder / press.id
-        frames, plan = stored_frames(folder), _plan(self._folder / f"{press.id}.json")
+        frames = stored_frames(folder)
+        plan = _plan(self._folder / f"{press.id}.json")
         if plan is None or not any(one.is_lit for one in frames) or _attempts(folder) >= MAX_ATTEMPTS:
             with suppress(StoreError):  # then the next opening deletes them
                 self._remove_frames(press.id)

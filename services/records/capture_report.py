@@ -46,7 +46,8 @@ def verdict_as_json(verdict: PictureVerdict) -> dict[str, JsonValue]:
 
 
 def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
-    made, light = report.reconstruction, report.light
+    made = report.reconstruction
+    light = report.light
     entries: dict[str, JsonValue] = {
         **vars(made),
         "warnings": list(made.warnings),
@@ -148,7 +149,9 @@ def read_report(content: object) -> CaptureReport:
     default, and the stored entry stays in `others`.
     """
     entries = _object(content)
-    verdict, moved, confirmed = entries.get("verdict"), entries.get("moved"), entries.get("confirmed")
+    verdict = entries.get("verdict")
+    moved = entries.get("moved")
+    confirmed = entries.get("confirmed")
     device = entries.get("device")
     report = CaptureReport(
         reconstruction=_reconstruction(entries),
@@ -206,8 +209,10 @@ def _frames(value: object) -> tuple[FrameUse, ...]:
 
 
 def _frame(entries: JsonObject) -> FrameUse:
-    index, used = _checked(entries, "index", _whole, 0), entries.get("used") is True
-    shift_px, weight = _checked(entries, "shift_px", _position, None), _checked(entries, "weight", _number, 0.0)
+    index = _checked(entries, "index", _whole, 0)
+    used = entries.get("used") is True
+    shift_px = _checked(entries, "shift_px", _position, None)
+    weight = _checked(entries, "weight", _number, 0.0)
     return FrameUse(index, used, shift_px, weight, _checked(entries, "reason", text, None))
 
 
@@ -220,8 +225,10 @@ def read_channels(value: object) -> tuple[ChannelUse, ...]:
 
 def _channel(entries: JsonObject) -> ChannelUse:
     name = one_of(entries.get("name"), *get_args(Colour))
-    shift_px, predicted = _checked(entries, "shift_px", _position, None), entries.get("predicted") is True
-    reason, white_ratio = _checked(entries, "reason", text, None), _checked(entries, "white_ratio", _number, None)
+    shift_px = _checked(entries, "shift_px", _position, None)
+    predicted = entries.get("predicted") is True
+    reason = _checked(entries, "reason", text, None)
+    white_ratio = _checked(entries, "white_ratio", _number, None)
     return ChannelUse(name, shift_px, predicted, reason, white_ratio, _checked(entries, "code", text, None))
 
 
@@ -252,7 +259,8 @@ def _moves(content: object) -> tuple[EyeCorrection, ...]:
 
 
 def _correction(entries: JsonObject) -> EyeCorrection:
-    from_eye, from_slot = one_of(entries["from_eye"], *EYES), text(entries["from_slot"])
+    from_eye = one_of(entries["from_eye"], *EYES)
+    from_slot = text(entries["from_slot"])
     eye, at, by = (_lenient(entries, name, text, None) for name in ("eye", "at", "by"))
     move = EyeCorrection(from_eye, from_slot, eye, at, by)
     return replace(move, others=_unwritten(entries, _correction_as_json(move)))
@@ -277,7 +285,8 @@ def _versions(content: object) -> tuple[CaptureVersion, ...]:
 
 
 def _version(entries: JsonObject) -> CaptureVersion:
-    number, result = _whole(entries.get("number")), text(entries.get("result"))
+    number = _whole(entries.get("number"))
+    result = text(entries.get("result"))
     at, method, software = (_lenient(entries, name, text, None) for name in ("at", "method", "software"))
     version = CaptureVersion(number, result, at, method, software)
     return replace(version, others=_unwritten(entries, _version_as_json(version)))

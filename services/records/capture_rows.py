@@ -54,7 +54,8 @@ def pages(session: Session, size: int, before: int | None = None) -> Iterator[Pa
         rows = capture_rows(session, query if before is None else query.where(before > CAPTURE_ROWID))
         if not rows:
             return
-        files, page = files_of(session, rows), Page([], [])
+        files = files_of(session, rows)
+        page = Page([], [])
         for row in rows:
             try:
                 page.captures.append(capture_of(row, files))

@@ -91,8 +91,10 @@ class CaptureStore:
         refusal: StoreError | None = None,
     ) -> None:
         self.folder, self.refusal = folder, refusal
-        self._captures, self._lock = folder / "captures", folder / ".lock"
-        database, quarantine = folder / schema.DATABASE, folder / "quarantine"
+        self._captures = folder / "captures"
+        self._lock = folder / ".lock"
+        database = folder / schema.DATABASE
+        quarantine = folder / "quarantine"
         with storage_errors(), ExitStack() as cleanup:
             refuse_earlier_store(database)
             _make_private(folder)
@@ -118,7 +120,8 @@ class CaptureStore:
                     self.write_ahead_log.checkpoint_if_possible()
                     ReserveFile(folder).allocate_if_room(reserve_bytes, free_bytes(folder))
                 else:
-                    self.recovery, self.newly_quarantined = RecoveryReport(rebuilt_because=damage), ()
+                    self.recovery = RecoveryReport(rebuilt_because=damage)
+                    self.newly_quarantined = ()
                     schema.refuse_changes(self.engine, refusal)
             cleanup.pop_all()
 
@@ -157,7 +160,8 @@ class CaptureStore:
         length_bytes = sum(map(_length_bytes, files.values()))  # rows and record, some kilobytes, fit into the reserve
         new_bytes = sum(len(content) for content in files.values() if isinstance(content, bytes))
         files = {**files, CAPTURE_RECORD: record.encoded()}
-        part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
+        part = self._captures / f".{capture.id}.part"
+        kept = self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):
             self._refuse_duplicate(part, kept)
             schema.refuse_if_read_only(self.engine)

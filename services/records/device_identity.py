@@ -32,7 +32,8 @@ class DeviceIdentity:
     @property
     def prefix(self) -> str:
         """Letters that begin the automatic patient numbers of this device, derived from its UUID."""
-        rest, letters = uuid.UUID(self.uuid).int, ""
+        rest = uuid.UUID(self.uuid).int
+        letters = ""
         for _ in range(PREFIX_LETTERS):
             rest, digit = divmod(rest, len(LETTERS))
             letters += LETTERS[digit]
@@ -46,7 +47,8 @@ def load_or_create_device(folder: Path, board_serial: Path = BOARD_SERIAL) -> De
     of its own, so that no two devices give the same numbers, and a log line reports it. `board_serial`: file with the
     serial number of the board. StoreDamaged if the file is unreadable, OSError if it must be and cannot be written.
     """
-    known, board = read_device(folder), board_serial_number(board_serial)
+    known = read_device(folder)
+    board = board_serial_number(board_serial)
     if known is not None and board in (None, known.serial):
         return known
     made = DeviceIdentity(str(uuid.uuid4()), board or secrets.token_hex(8))

@@ -52,7 +52,9 @@ def raise_to(state: DoseLedgerState, other: DoseLedgerState) -> None:
     With the observed time, `boot` and `now_s` are those of `other`.
     """
     if other.observed_s > state.observed_s:
-        state.observed_s, state.boot, state.now_s = other.observed_s, other.boot, other.now_s
+        state.observed_s = other.observed_s
+        state.boot = other.boot
+        state.now_s = other.now_s
     for key, dose_j_per_cm2 in other.doses.items():
         state.doses[key] = max(state.doses.get(key, 0.0), dose_j_per_cm2)
 

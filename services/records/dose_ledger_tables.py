@@ -127,7 +127,9 @@ class DoseLedgerStore:
             state.add(eyes, row.interval, row.dose_j_per_cm2)
         seen = session.get(ObservedTimeRow, 1)
         if seen is not None:
-            state.observed_s, state.boot, state.now_s = seen.observed_s, seen.boot, seen.now_s
+            state.observed_s = seen.observed_s
+            state.boot = seen.boot
+            state.now_s = seen.now_s
         if (copy := self._log.newest()) is not None:
             raise_to(state, copy)
         state.advance(self._boot, self._clock.now_s(), self._window_s)

@@ -65,7 +65,8 @@ class StoredFrame:
         counts, metadata = picture_files.read_raw_tiff(read_blob(self.file.path))
         if metadata.exposure_s is None or metadata.simulated is None:
             raise FrameError(f"{self.file.path.name} has no exposure time, or no mark of its origin")
-        light, simulated = metadata.illumination, metadata.simulated
+        light = metadata.illumination
+        simulated = metadata.simulated
         return Frame(counts, metadata.exposure_s, self.number, light, simulated), metadata
 
 

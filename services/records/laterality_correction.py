@@ -106,7 +106,9 @@ def relabel(session: Session, shot: CaptureSlotRow, to: Slot, at: datetime, by: 
     counted = {from_eye, *(one.from_eye for one in report.moved)}
     if to.eye not in counted:
         add_given_dose(session, to.eye, report.light.dose_j_per_cm2 or 0.0)
-    row.eye, row.report, shot.slot = to.eye, schema.report_text(report_as_json(report)), to.id
+    row.eye = to.eye
+    row.report = schema.report_text(report_as_json(report))
+    shot.slot = to.id
 
 
 def _eye(row: CaptureRow) -> Eye:

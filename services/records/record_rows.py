@@ -34,7 +34,7 @@ from services.records.schema import (
 )
 
 CAPTURE_VALUES = ("eye", "taken_at", "simulated", "calibration_id", "report", "request")
-MOST_OF_ONE_NUMBER = 99  # patients that got the same number after restorations of older tables
+MAX_OF_ONE_NUMBER = 99  # patients that got the same number after restorations of older tables
 IDENTITY_VERSION = 1  # version of the encoding of the identifying fields
 Content = dict[str, JsonValue]
 R = TypeVar("R", PatientRow, VisitRow)
@@ -138,11 +138,11 @@ def _free_number(session: Session, number: str, patient_id: str) -> str:
     known = session.scalar(select(PatientRow.number).where(PatientRow.patient_id == patient_id))
     if known is not None:
         return known
-    candidates = (number, *(numbering.with_ending(number, f"-{count}") for count in range(2, MOST_OF_ONE_NUMBER + 1)))
+    candidates = (number, *(numbering.with_ending(number, f"-{count}") for count in range(2, MAX_OF_ONE_NUMBER + 1)))
     for candidate in candidates:
         if session.get(PatientRow, candidate) is None:
             return candidate
-    raise ValueError(f"{MOST_OF_ONE_NUMBER} patients have the number {number!r:.60}")
+    raise ValueError(f"{MAX_OF_ONE_NUMBER} patients have the number {number!r:.60}")
 
 
 def restore_visit(session: Session, content: JsonObject) -> bool:
@@ -151,7 +151,8 @@ def restore_visit(session: Session, content: JsonObject) -> bool:
     A patient without rows gets a row with that number and no identifying field. Errors as in `restore_patient`.
     """
     row, answers, uploads, _ = _visit_rows(content)
-    described, patient_id = row.patient, row_validation.text(content["patient_id"])
+    described = row.patient
+    patient_id = row_validation.text(content["patient_id"])
     row.patient = _free_number(session, described, patient_id)
     if session.get(PatientRow, row.patient) is None:
         session.add(PatientRow(number=row.patient, made_at=row.begun_at, patient_id=patient_id))
@@ -245,7 +246,8 @@ def _restore_request(session: Session, request: str | None, answer: str, at: str
 
 def _patient_rows(content: JsonObject) -> tuple[PatientRow, list[IdentifierRow]]:
     """Return the rows that the content of a patient describes."""
-    number, identity = row_validation.text(content["number"]), as_object(content["identity"])
+    number = row_validation.text(content["number"])
+    identity = as_object(content["identity"])
     row_validation.one_of(identity["version"], IDENTITY_VERSION)
     blob = base64.b64decode(row_validation.text(identity["blob"]), validate=True)
     values = as_object(row_validation.parsed_json(blob.decode()))
@@ -255,7 +257,8 @@ def _patient_rows(content: JsonObject) -> tuple[PatientRow, list[IdentifierRow]]
 
 def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[UploadRow], list[SlotDecisionRow]]:
     """Return the rows that the content of a visit describes."""
-    id, outcome = row_validation.text(content["id"]), content["outcome"]
+    id = row_validation.text(content["id"])
+    outcome = content["outcome"]
     finished_at, sent, request = (_text_or_none(content[name]) for name in ("finished_at", "sent", "request"))
     row = VisitRow(
         id=id,
@@ -298,7 +301,8 @@ def _upload_row(visit: str, finished_at: str, upload: JsonObject) -> UploadRow:
 
 
 def _file_row(name: str, file: JsonObject) -> FileRow:
-    digest, length = row_validation.text(file["sha256"]), whole_number(file["bytes"])
+    digest = row_validation.text(file["sha256"])
+    length = whole_number(file["bytes"])
     return FileRow(name=row_validation.text(name), sha256=digest, bytes=length)
 
 

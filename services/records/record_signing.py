@@ -40,7 +40,8 @@ def recorded(engine: Engine) -> Iterator[Session]:
     If the block or the commit fails, the files describe the rows as before. Errors: those of the block, of the disk and
     of SQLite, which `storage_errors` converts.
     """
-    files, written = RecordFiles(schema.folder_of(engine)), list[RecordDocument]()
+    files = RecordFiles(schema.folder_of(engine))
+    written = list[RecordDocument]()
     with Session(schema.for_writing(engine)) as session:
         try:
             with session.begin():
@@ -117,7 +118,8 @@ def refuse_changed(kind: Kind, row: RecordRow | Row[*tuple[Any, ...]], content: 
 
 
 def _sign_kind(session: Session, kind: Kind) -> list[RecordDocument]:
-    table, key = schema.RECORD_TABLES[kind], schema.RECORD_KEYS[kind]
+    table = schema.RECORD_TABLES[kind]
+    key = schema.RECORD_KEYS[kind]
     keys = row_validation.readable_keys(session.scalars(select(key).where(table.record_sha256.is_(None))))
     signed = []
     for start in range(0, len(keys), PAGE_ROWS):

@@ -82,7 +82,9 @@ class Recovery:
     """Recovery of the rows of the store in `folder`; the caller holds the lock of the store."""
 
     def __init__(self, folder: Path, engine: Engine, rebuilt_because: str | None) -> None:
-        self._folder, self._engine, self._files = folder, engine, RecordFiles(folder)
+        self._folder = folder
+        self._engine = engine
+        self._files = RecordFiles(folder)
         self.report = RecoveryReport(rebuilt_because=rebuilt_because)
         self._restored_visits: list[tuple[RecordDocument, bool]] = []
 
@@ -125,7 +127,8 @@ class Recovery:
 
         The file of a capture is read only if its rows are damaged or unsigned, or belong to one of `of_visits`.
         """
-        to_write, known = [], set[str]()
+        to_write = []
+        known = set[str]()
         keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
         for start in range(0, len(keys), PAGE_ROWS):
             rows = rows_of(session, kind, keys[start : start + PAGE_ROWS])
@@ -173,7 +176,8 @@ class Recovery:
         Conflicts arise after older tables were restored: what had been changed was changed once more.
         """
         use_file = _last_change(in_file.content) >= _last_change(in_rows.content)
-        folder, other = self._folder / "conflicts", in_rows if use_file else in_file
+        folder = self._folder / "conflicts"
+        other = in_rows if use_file else in_file
         atomic_io.make_folder(folder)
         name = f"{other.kind}-{other.id}-{other.revision}-{other.sha256()[:8]}.json"
         atomic_io.write_atomically(folder / name, other.encoded())

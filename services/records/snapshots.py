@@ -31,7 +31,8 @@ class Snapshots:
     """Snapshots of one database file, in the folder `snapshots` beside it."""
 
     def __init__(self, database: Path, clock: Clock, free_bytes: Callable[[Path], int] = atomic_io.free_bytes) -> None:
-        self.database, self.folder = database, database.parent / "snapshots"
+        self.database = database
+        self.folder = database.parent / "snapshots"
         self._clock, self._free_bytes = clock, free_bytes
 
     def names(self) -> list[str]:
@@ -96,7 +97,8 @@ class Snapshots:
 
         The reserve that captures leave free may be used, because it is meant for updates.
         """
-        need, free = 2 * size_bytes + MARGIN_BYTES, self._free_bytes(self.database.parent)
+        need = 2 * size_bytes + MARGIN_BYTES
+        free = self._free_bytes(self.database.parent)
         if not atomic_io.has_room(need, free, reserve_bytes=0):
             raise StoreFull(
                 f"{free} bytes are free; {need} are needed to copy the tables before they are changed",

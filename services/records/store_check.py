@@ -64,7 +64,8 @@ def check_store(folder: Path, progress: Progress) -> list[Checked]:
 
 
 def _checked_database(folder: Path) -> Checked:
-    result, damage = Checked("database"), damage_of(folder / schema.DATABASE)
+    result = Checked("database")
+    damage = damage_of(folder / schema.DATABASE)
     if damage is None:
         result.whole = 1
     elif RecordFiles(folder).exist():
@@ -87,7 +88,9 @@ def _checked_records(
     folder: Path, kind: Kind, name: str, with_rows: bool, documents: dict[tuple[Kind, str], RecordDocument]
 ) -> Checked:
     """Compare rows and files of all records of a kind; add the newest whole state of each to `documents`."""
-    result, files, known = Checked(name), RecordFiles(folder), set[str]()
+    result = Checked(name)
+    files = RecordFiles(folder)
+    known = set[str]()
     for id, in_rows in _records_in_rows(folder, kind) if with_rows else ():
         known.add(id)
         in_file = _in_file(files, kind, id)

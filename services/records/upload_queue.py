@@ -100,7 +100,8 @@ class UploadQueue:
 
     def status(self) -> QueueStatus:
         """Return the numbers of waiting, stuck and failing visits; visits with unreadable rows are counted too."""
-        stuck, failing = self._stuck(), UploadRow.error.is_not(None)
+        stuck = self._stuck()
+        failing = UploadRow.error.is_not(None)
         numbers = func.count(), func.count(case((stuck, 1))), func.count(case((and_(failing, not_(stuck)), 1)))
         query = select(*numbers).select_from(VisitRow).outerjoin(UploadRow, SAME_FINISH).where(UNSENT)
         dates = select(UploadRow.failing_since).join(VisitRow, SAME_FINISH).where(UNSENT, stuck)
@@ -138,7 +139,9 @@ class UploadQueue:
         with storage_errors(), Session(schema.for_writing(self.engine)) as session, session.begin():
             for one in which:
                 row = _attempt_row(session, one)
-                row.tries, row.error, row.message = row.tries + 1, error.code, error.message
+                row.tries = row.tries + 1
+                row.error = error.code
+                row.message = error.message
                 row.failing_since = row.failing_since or now
 
     def record_success(self, one: QueuedVisit, receipt: UploadReceipt) -> None:
@@ -146,11 +149,17 @@ class UploadQueue:
 
         A visit that was finished again meanwhile stays in the queue.
         """
-        now, finish = self.clock.wall(), schema.utc_text(one.finished_at)
+        now = self.clock.wall()
+        finish = schema.utc_text(one.finished_at)
         with storage_errors(), recorded(self.engine) as session:
             row = _attempt_row(session, one)
-            row.tries, row.error, row.message, row.failing_since = row.tries + 1, None, None, None
-            row.sent_at, row.sha256, row.confirmed = schema.utc_text(now), receipt.sha256, receipt.confirmed
+            row.tries = row.tries + 1
+            row.error = None
+            row.message = None
+            row.failing_since = None
+            row.sent_at = schema.utc_text(now)
+            row.sha256 = receipt.sha256
+            row.confirmed = receipt.confirmed
             session.execute(update(VisitRow).where(VisitRow.id == one.visit).values(sent=finish))
 
     def clear_errors(self, visit: str | None) -> None:
@@ -169,7 +178,8 @@ def _waiting(visit: VisitRow, upload: UploadRow | None, stuck: bool | None) -> Q
     StoreDamaged too if `finished_at` is not in the notation of `schema.utc_text`: it would never equal `sent`.
     """
     with reading_record(visit.id):
-        id, number = row_validation.text(visit.id), row_validation.text(visit.patient)
+        id = row_validation.text(visit.id)
+        number = row_validation.text(visit.patient)
         finished_at = row_validation.timestamp(visit.finished_at)
         row_validation.one_of(visit.finished_at, schema.utc_text(finished_at))
         if upload is None:

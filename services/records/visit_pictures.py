@@ -45,7 +45,8 @@ class VisitPictures:
                 frames=self._protocol.frames,
                 colours=self._protocol.colours,
             )
-        visit, protocol_slot = self._get(id), self._protocol.slot(slot)
+        visit = self._get(id)
+        protocol_slot = self._protocol.slot(slot)
         if protocol_slot.eye != eye:
             raise InputError(f"{slot} is a picture of {protocol_slot.eye}, not of {eye}", CHOOSE_REMEDY)
         if visit.finished_at is not None:
@@ -72,7 +73,8 @@ class VisitPictures:
 
         RecordNotFound if the programme no longer has its slot.
         """
-        key, entry = interrupted.key, interrupted.press
+        key = interrupted.key
+        entry = interrupted.press
         request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
         field = None if entry.slot is None else self._protocol.slot(entry.slot).field
         return CaptureTarget(
@@ -147,7 +149,8 @@ class VisitPictures:
             shot = laterality_correction.slot_row_of(session, capture)
             row = visit_rows.unfinished_row(session, shot.visit)
             before = visit_queries.read_visit(session, self._protocol, row).slots
-            to, from_slot = laterality_correction.slot_of_same_field(self._protocol, shot.slot, eye), shot.slot
+            to = laterality_correction.slot_of_same_field(self._protocol, shot.slot, eye)
+            from_slot = shot.slot
             if to.id == from_slot:
                 laterality_correction.confirm(session, shot, self._clock.wall(), by)
                 return shot.visit
@@ -223,7 +226,8 @@ class VisitPictures:
 
         A finished visit gets a new outcome and a new `finished_at`, so that it is uploaded again.
         """
-        id, slot = report.visit, report.slot
+        id = report.visit
+        slot = report.slot
         if id is None or slot is None:
             raise SettingError(f"the report of {capture} names no visit or no slot")
         row = visit_queries.visit_row(session, id)

@@ -95,8 +95,10 @@ def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) 
     """Return the visits of these rows, in the same order, without those that cannot be read."""
     known = without_damaged(rows, _checked_row)
     contents = visit_contents(session, known)
-    ids, fields = [row.id for row in known], _fields(session, known)
-    taken, decided = _taken(session, ids), _decided(session, ids)
+    ids = [row.id for row in known]
+    fields = _fields(session, known)
+    taken = _taken(session, ids)
+    decided = _decided(session, ids)
 
     def visit(row: VisitRow) -> Visit:
         with reading_record(row.id):

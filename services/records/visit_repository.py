@@ -44,7 +44,8 @@ class VisitRepository:
         def act(session: Session) -> str:
             now = self.clock.wall()
             self.requests.delete_expired(session)
-            prefix, begun_at = self.protocol.programme.prefix, schema.utc_text(now)
+            prefix = self.protocol.programme.prefix
+            begun_at = schema.utc_text(now)
             number_of_patient = patient_rows.patient_number(session, prefix, number, begun_at)
             id = f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
             day = now.astimezone().date().isoformat()
@@ -96,7 +97,8 @@ class VisitRepository:
         value = answers.validate_answer(name, value)
 
         def act(session: Session) -> str:
-            patient, now = visit_rows.unfinished_row(session, id).patient, schema.utc_text(self.clock.wall())
+            patient = visit_rows.unfinished_row(session, id).patient
+            now = schema.utc_text(self.clock.wall())
             if name not in answers.IDENTIFIERS:  # null is an answer too: no drops were given
                 session.merge(AnswerRow(visit=id, name=name, value=json.dumps(value), set_at=now))
             elif value is not None:

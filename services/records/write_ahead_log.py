@@ -16,7 +16,8 @@ class WriteAheadLog:
     """Write-ahead log of one SQLite file, `<database>-wal`."""
 
     def __init__(self, database: Path, engine: Engine) -> None:
-        self._path, self._engine = database.with_name(f"{database.name}-wal"), engine
+        self._path = database.with_name(f"{database.name}-wal")
+        self._engine = engine
 
     def checkpoint(self) -> bool:
         """Move all rows of the write-ahead log into the main file and truncate the log.

@@ -93,7 +93,8 @@ def case_of(pair: Pair, calibration: Calibration, aligned: bool) -> Case:
 
 def without_bad_pixels(pair: Pair) -> Pixels:
     """Return the counts with bad pixels set to the median, for peers that take no mask."""
-    pixels, bad = pair.raw.pixels, pair.raw.bad
+    pixels = pair.raw.pixels
+    bad = pair.raw.bad
     if not bad.any():
         return pixels
     filled = pixels.copy()
@@ -140,7 +141,8 @@ def benchmark(
         tuple(run.left_out),
     )
     if request.json is not None:
-        place, text = request.json, json.dumps(asdict(found), indent=1) + "\n"
+        place = request.json
+        text = json.dumps(asdict(found), indent=1) + "\n"
         write_or_raise(place, lambda: place.write_text(text, encoding="utf-8"))
     return found
 
@@ -157,7 +159,9 @@ class _Run:
         clock: Clock,
         peer: LenslessPeer | None,
     ) -> None:
-        self.layout, self.methods, self.repeats = dataset.layout, methods, repeats
+        self.layout = dataset.layout
+        self.methods = methods
+        self.repeats = repeats
         self.planner, self.clock, self.peer = planner, clock, peer
         self.scores: list[PairScore] = []
         self.left_out: list[LeftOut] = []

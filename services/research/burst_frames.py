@@ -16,7 +16,8 @@ from device.recon.model.kernels import Pixels
 from device.values import FrameUse, Image, Psf
 from services.research.reconstruct_inputs import LoadedRaw, refuse_without_signal
 
-LOW, HIGH = (2, 5), (10, 30)  # cycles per shorter side of a frame
+LOW = (2, 5)  # cycles per shorter side of a frame
+HIGH = (10, 30)
 # Power at HIGH over that at LOW, of a frame over that of its PSF: a point has 1 and PSFs of other depths 0.4 to 2.4, an
 # object falls with the frequency: recordings have 0.001 to 0.007, simulated frames 0.02 at 100 electrons.
 PSF_LIKE = 0.1

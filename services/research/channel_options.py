@@ -40,11 +40,15 @@ def refuse_stray(words: Sequence[str], with_value: Collection[str]) -> None:
     A shell writes `raw.tiff --psf psf*.tiff` out as several files, and all but the first would be frames of a burst.
     `with_value`: the options that take a value.
     """
-    rest, option, value, raw_given = iter(words), "", "", False
+    rest = iter(words)
+    option = ""
+    value = ""
+    raw_given = False
     for word in rest:
         name, equals, given = word.partition("=")
         if name in with_value:
-            option, value = name, given if equals else next(rest, "")
+            option = name
+            value = given if equals else next(rest, "")
         elif word.startswith("-"):
             option = ""
         elif option in ("--psf", "--dark", "--flat") and raw_given:
@@ -54,12 +58,15 @@ def refuse_stray(words: Sequence[str], with_value: Collection[str]) -> None:
                 f"Give all raws first. {remedy if option == '--psf' else f'One file belongs to {option}.'}",
             )
         else:
-            option, raw_given = "", True
+            option = ""
+            raw_given = True
 
 
 def _joined(args: Sequence[str]) -> list[str]:
     stored = any(word.partition("=")[0] == "--calibration" for word in args)
-    words, joined, count = iter(args), [], 2 if stored else 3
+    words = iter(args)
+    joined = []
+    count = 2 if stored else 3
     for word in words:
         joined.append(word)
         if word == "--channel":

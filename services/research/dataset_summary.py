@@ -24,7 +24,8 @@ def summary(dataset: Dataset) -> str:
 
     FrameError or PsfError if the first pair cannot be read.
     """
-    first, layout = dataset.read(dataset.entries[0]), dataset.layout
+    first = dataset.read(dataset.entries[0])
+    layout = dataset.layout
     with_truth = sum(entry.truth is not None for entry in dataset.entries)
     lines = [
         f"{dataset.folder}: {layout.title}",

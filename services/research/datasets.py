@@ -257,7 +257,8 @@ def _find_simulated(folder: Path) -> Found | None:
 
 
 def _find_pairs(folder: Path) -> Found | None:
-    raws, psfs = _images(folder / "raw"), _psfs(folder)
+    raws = _images(folder / "raw")
+    psfs = _psfs(folder)
     return Found(PAIRS, raws, _images(folder / "truth"), psfs) if raws and psfs else None
 
 

@@ -61,7 +61,7 @@ from services.research.reconstruct_inputs import (
 )
 
 ROUNDS = (0, 1, 2, 4, 8, 12, 20)
-MOST_BIN, LEAST_SAMPLES = 4, 48
+MAX_BIN, MIN_SAMPLES = 4, 48
 RIM_PX = 2.0  # width of the blurred field edge, which is excluded from scores
 HIGHPASS_DEG, HIGHPASS_PX = 2.0, 32.0
 ProgressCallback = Callable[[str], None]
@@ -239,7 +239,8 @@ class _Bench:
         self, case: Case, planner: Planner, clock: Clock, progress: ProgressCallback, methods: Mapping[str, Method]
     ) -> None:
         self.case, self.planner, self.clock, self.progress = case, planner, clock, progress
-        self.methods, self.chosen = methods, np.zeros(case.shape, np.float32)
+        self.methods = methods
+        self.chosen = np.zeros(case.shape, np.float32)
         geometry = case.calibration.geometry
         self.detail_px = HIGHPASS_DEG * geometry.px_per_deg if geometry else HIGHPASS_PX
         self.inside, self.where = scored_region(case)
@@ -323,7 +324,8 @@ class _Bench:
 
     def thumbnails(self, found: Frontier) -> Panel:
         """Return the thumbnails of the best pictures within some times and of the chosen one, after `measure`."""
-        choice, shown = found.choice, []
+        choice = found.choice
+        shown = []
         for p in nearest_points(drawn_points(found), choice.seconds_median):
             recipe = next(
                 one for one in self.recipes if (one.method, one.bin, one.rounds or 0) == (p.method, p.bin, p.rounds)
@@ -361,7 +363,8 @@ class _Bench:
             Point(recipe.method, recipe.bin, rounds, *_summary(seconds), **asdict(scores))
             for (recipe, rounds, scores), seconds in zip(scored, times, strict=True)
         )
-        report, self.chosen = last.report, self.moved(_grey(last.picture))
+        report = last.report
+        self.chosen = self.moved(_grey(last.picture))
         refract_s = float(np.median([each.report.seconds["refract"] for each in made]))
         solve_s = _summary(own)[0] - refract_s
         scores = self.score(last)
@@ -438,9 +441,9 @@ def _name(recipe: Recipe) -> str:
 def _recipes(shape: tuple[int, int], working: int, methods: Mapping[str, Method]) -> list[Recipe]:
     """Return every method at every usable bin, iterative ones at each number in ROUNDS and at their default number.
 
-    Bins go up to MOST_BIN, or to the `working` bin of the default schedule if that is larger.
+    Bins go up to MAX_BIN, or to the `working` bin of the default schedule if that is larger.
     """
-    bins = [n for n in range(1, max(MOST_BIN, working) + 1) if n == 1 or min(shape) // n >= LEAST_SAMPLES]
+    bins = [n for n in range(1, max(MAX_BIN, working) + 1) if n == 1 or min(shape) // n >= MIN_SAMPLES]
     wanted = []
     for method in methods.values():
         rounds = sorted({*ROUNDS, method.rounds}) if method.round_pairs else (None,)

@@ -47,7 +47,8 @@ class LightCase:
 
 def light_case(spec: InstrumentSpec) -> LightCase:
     """Return a burst of the largest of NUMBERS, exposed with the lamp on throughout; SpecError as `World`."""
-    world, exposure_s = World(spec, VirtualClock()), spec.camera.exposure_s
+    world = World(spec, VirtualClock())
+    exposure_s = spec.camera.exposure_s
     lamp = Illumination(spec.light.colour)
     world.present_eye("OD")
     frames = lit_frames(world, max(NUMBERS))
@@ -68,7 +69,8 @@ def measure_light(
 
     The time is the median of REPEATS, with that of the refraction.
     """
-    burst, found = BurstReconstructor(instrument, planner), []
+    burst = BurstReconstructor(instrument, planner)
+    found = []
     for n in NUMBERS:
         seconds = []
         for _ in range(REPEATS):
@@ -103,14 +105,16 @@ def linear_bound(calibration: Calibration, mean_dn: float, n: int, truth: Image)
     The frame is that of a still `truth` (rows, cols) behind exactly the calibrated PSF, periodic, with `n` frames of a
     mean of `mean_dn` above dark.
     """
-    shape, sensor = (truth.shape[0], truth.shape[1]), calibration.sensor
+    shape = (truth.shape[0], truth.shape[1])
+    sensor = calibration.sensor
     field = disc(shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), field_radius_px(calibration))
     otf = fft.rfft2(fft.ifftshift(crop_or_pad(calibration.psfs[0].pixels, shape)))
     seen = np.where(np.isfinite(truth), truth, 0) * field
     seen *= np.float32(mean_dn / max(float(seen.mean()), 1e-30))
     detail = seen - field * np.float32(seen.sum(dtype=np.float64) / field.sum(dtype=np.float64))
     power = _ring_mean(np.abs(fft.rfft2(detail)) ** 2, shape)
-    gain, read_e = sensor.gain_e_per_dn or 1.0, sensor.read_noise_e or 0.0
+    gain = sensor.gain_e_per_dn or 1.0
+    read_e = sensor.read_noise_e or 0.0
     blurred = np.maximum(fft.irfft2(otf * fft.rfft2(seen), shape), 0)
     variance_dn2 = (blurred / gain + (read_e / gain) ** 2) / n
     noise = np.random.default_rng(n).standard_normal(shape) * np.sqrt(variance_dn2)
@@ -124,5 +128,6 @@ def _ring_mean(power: Image, shape: Sequence[int]) -> Image:
     """Return each value of a half spectrum replaced by the mean over frequencies of its radius."""
     radius = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None])
     ring = np.round(radius * max(shape)).astype(np.int64)
-    total, count = np.bincount(ring.ravel(), power.ravel().astype(np.float64)), np.bincount(ring.ravel())
+    total = np.bincount(ring.ravel(), power.ravel().astype(np.float64))
+    count = np.bincount(ring.ravel())
     return np.asarray((total / np.maximum(count, 1))[ring], np.float32)

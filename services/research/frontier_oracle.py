@@ -57,7 +57,8 @@ def _pictures(
     model = METHODS["tikhonov"].model(calibration, (counts.shape[0], counts.shape[1]), n, planner, 0)
     preparer = Preprocessor(calibration, model.grid)
     for mu in MUS:
-        solver, out = ClosedForm(model, TIKHONOV, mu), np.zeros(model.grid.shape, np.float32)
+        solver = ClosedForm(model, TIKHONOV, mu)
+        out = np.zeros(model.grid.shape, np.float32)
         begin_s = clock.now_s()
         solver.start(preparer(counts))
         solver.finish(out)

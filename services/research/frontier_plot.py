@@ -11,7 +11,7 @@ from services.research.frontier_thumbnails import LETTERS, nearest_points
 
 PEER_KIND, BURST_KIND, BOUND_KIND = 5, 6, 7  # of marks, the same in both plots
 LETTER_WEIGHT = 1.2  # of the marks of thumbnails
-LEAST_REFRACTION_S = 0.001  # less is the decision against an estimate, not an estimate
+MIN_REFRACTION_S = 0.001  # less is the decision against an estimate, not an estimate
 
 
 def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS, thumbnails: Panel | None = None) -> str:
@@ -46,7 +46,8 @@ def _key(point: Point) -> tuple[str, int, int]:
 def _time_plot(
     found: Frontier, methods: Mapping[str, Method], points: Sequence[Point], letters: Mapping[tuple[str, int, int], str]
 ) -> Plot:
-    choice, budget_s = found.choice, found.budget_s
+    choice = found.choice
+    budget_s = found.budget_s
     edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
     words = "" if found.light else " (rounds)"  # the legend has no room for it beside bursts and peers
     kinds = {name: kind for kind, name in enumerate(dict.fromkeys((*METHODS, *methods)))}  # the choice is built in
@@ -83,7 +84,7 @@ def _axis_title(found: Frontier) -> str:
 
 
 def _refraction(found: Frontier) -> str:
-    if found.choice.refract_s < LEAST_REFRACTION_S:
+    if found.choice.refract_s < MIN_REFRACTION_S:
         return "the budget leaves no time for the eye's refraction"
     return f"the chosen one includes {found.choice.refract_s * 1e3:.0f} ms for the eye's refraction"
 
@@ -118,9 +119,11 @@ def _chosen(found: Frontier, kind: int, letter: str) -> Series:
 
 def _light_plot(found: Frontier) -> Plot:
     """Return accuracy against the dose: bursts, and the bound of a linear filter with as much light."""
-    bursts, bounds = [], []
+    bursts = []
+    bounds = []
     for one in found.light:
-        dose_uj_per_cm2, words = one.dose_j_per_cm2 * 1e6, _frames(one)
+        dose_uj_per_cm2 = one.dose_j_per_cm2 * 1e6
+        words = _frames(one)
         spent = f"{words}, {dose_uj_per_cm2:.3g} uJ/cm2: {one.seconds_median * 1e3:.0f} ms"
         label = f"{words} in {one.seconds_median:.2g} s"
         bursts.append(Mark(dose_uj_per_cm2, one.psnr_db, label, f"{spent}, {one.psnr_db:.2f} dB"))
@@ -151,7 +154,8 @@ def _number(value: float) -> str:
 
 
 def _subtitle(found: Frontier) -> str:
-    machine, frame = found.machine, found.frame
+    machine = found.machine
+    frame = found.frame
     kind = "simulated" if found.simulated else "recorded"
     return (
         f"{frame.rows} x {frame.cols} pixels, {kind}; {machine.cpu or 'unknown processor'}, "

@@ -174,7 +174,9 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
     A pair dominates another if its cost is at most as high, its worth at least as high, and one of both is better.
     """
     order = sorted(range(len(points)), key=lambda k: (points[k][0], -points[k][1]))
-    on, best, at_s = [False] * len(points), -inf, -inf
+    on = [False] * len(points)
+    best = -inf
+    at_s = -inf
     for k in order:
         cost, worth = points[k]
         on[k] = worth > best or (worth == best and cost == at_s)  # equal pairs do not dominate each other

@@ -20,7 +20,8 @@ TIMES_S = (0.005, 0.02, 0.07)  # of the pictures that are shown, as near as ther
 LETTERS = "ABCD"
 SIDE_PX, PITCH_PX, TOP_PX, HEIGHT_PX = 140, 167, 34, 282  # of a thumbnail; from one to the next; in the panel
 CROP = 0.25  # side of the crop over the shorter side of the frame
-FINE, COARSE = 1 / 140, 1 / 28  # standard deviations of a spot and of its surroundings, over the side of the crop
+FINE = 1 / 140  # standard deviations of a spot and of its surroundings, over the side of the crop
+COARSE = 1 / 28
 SPOT_SD, SEEN, ERROR_SD = 1.0, 0.5, 3.0  # least contrast: in all detail; share of the truth's; in the picture's error
 CAPTION_LETTERS = 118
 Box = tuple[slice, slice]
@@ -119,7 +120,8 @@ def _thumbnail(x: float, lines: Sequence[str], png: str) -> list[str]:
 def _png(crop: Plane, low: float, high: float, simulated: bool) -> str:
     """Return a crop as base64 of a PNG with at most SIDE_PX pixels a side; grey from `low` to `high`."""
     n = max(1, crop.shape[0] // SIDE_PX)
-    rows, cols = crop.shape[0] // n, crop.shape[1] // n
+    rows = crop.shape[0] // n
+    cols = crop.shape[1] // n
     mean = crop[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3))
     grey = np.clip((mean - low) / max(high - low, 1e-30), 0, 1) * 255
     return b64encode(png_bytes(np.round(grey).astype(np.uint8), simulated)).decode()

@@ -35,11 +35,15 @@ def peak_mb(psf: np.ndarray, data: np.ndarray) -> float:
 def solve(folder: Path) -> list[dict[str, float | str | None]]:
     """Solve `in.npz` with each number of rounds; planning is not timed."""
     with np.load(folder / "in.npz") as given:
-        y, psf, every, measured = given["y"], given["psf"], given["rounds"], bool(given["memory"])
+        y = given["y"]
+        psf = given["psf"]
+        every = given["rounds"]
+        measured = bool(given["memory"])
     psf = np.maximum(psf, 0)
     channels = np.atleast_3d(y)
     spread = np.repeat(np.atleast_3d(psf / np.linalg.norm(psf)), channels.shape[2], axis=2)
-    spread, data = spread.astype(np.float32)[None], (np.maximum(channels, 0) / y.max()).astype(np.float32)[None]
+    spread = spread.astype(np.float32)[None]
+    data = (np.maximum(channels, 0) / y.max()).astype(np.float32)[None]
     mb = peak_mb(spread, data) if measured else None
     solver = planned(spread, data)
     found: list[dict[str, float | str | None]] = []

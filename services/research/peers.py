@@ -43,7 +43,9 @@ class LenslessPeer:
     """
 
     def __init__(self, environment: Path, rounds: Sequence[int], memory: bool = False) -> None:
-        self.python, self.rounds, self.memory = environment / "bin" / "python", tuple(rounds), memory
+        self.python = environment / "bin" / "python"
+        self.rounds = tuple(rounds)
+        self.memory = memory
         self._process: subprocess.Popen[str] | None = None
         self._temporary = TemporaryDirectory()
         self._folder = Path(self._temporary.name)
@@ -100,7 +102,8 @@ class LenslessPeer:
         if not self.is_installed:
             raise SettingError(f"LenslessPiCam is not installed: there is no {self.python}", REMEDY)
         with self._log.open("w", encoding="utf-8") as log:
-            command, pipe = [str(self.python), "-I", str(SCRIPT), self._temporary.name], subprocess.PIPE
+            command = [str(self.python), "-I", str(SCRIPT), self._temporary.name]
+            pipe = subprocess.PIPE
             return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=log, text=True)
 
     @property
@@ -109,7 +112,8 @@ class LenslessPeer:
 
     def _stop(self) -> None:
         """End the process, if it runs, and wait for it."""
-        process, self._process = self._process, None
+        process = self._process
+        self._process = None
         if process is None:
             return
         process.kill()

@@ -167,7 +167,8 @@ class ForwardModel:
         frame whose noise is shot noise. FrameError for another shape.
         """
         _require(y, self.frame_shape, "the frame")
-        window, fft = taper(self.frame_shape), self._model.fft
+        window = taper(self.frame_shape)
+        fft = self._model.fft
         fft.space[:] = 0
         fft.space[self._model.grid.slices] = (y - np.float32(y.mean(dtype=np.float64))) * window
         size = self._model.grid.size
@@ -286,7 +287,8 @@ def methods() -> dict[str, Method]:
 
 def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOptions) -> ReconstructOptions:
     _refuse_unknown(given)
-    dark, flat = given.get("dark"), given.get("flat")
+    dark = given.get("dark")
+    flat = given.get("flat")
     psfs = psf if isinstance(psf, list | tuple) else (psf,)
     return ReconstructOptions(
         raw=Path(),
@@ -338,7 +340,8 @@ def _head(head: "str | Path | SimulatedScene | None") -> Path | InstrumentSpec |
 def _scene_case(scene: str | Path | SimulatedScene) -> Case:
     if not isinstance(scene, SimulatedScene):
         return scene_case(load_head(scene_file(scene)))
-    counts, calibration = np.asarray(scene.raw), simulated_calibration(scene.world)
+    counts = np.asarray(scene.raw)
+    calibration = simulated_calibration(scene.world)
     return Case(scene.name, counts, scene.truth, scene.vessels, calibration, False)
 
 

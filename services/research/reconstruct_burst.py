@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from device.errors import FrameError, SettingError
-from device.recon.burst import MOST_FRAMES
+from device.recon.burst import MAX_FRAMES
 from device.recon.colour import CHANNELS
 from device.values import Colour
 from services.research.burst_frames import refuse_psfs, refuse_repeated, refuse_without_first
@@ -64,7 +64,8 @@ def reconstruct_colours(
     reference, with `channels`. SettingError for options that do not fit, FrameError as for a burst, and if no other
     colour can be joined.
     """
-    channels, darks = _by_name(sources), darks or {}
+    channels = _by_name(sources)
+    darks = darks or {}
     _refuse_invalid_channels(channels, options, darks)
     reference: Colour = "green" if "green" in channels else next(iter(channels))
     of_colours = {
@@ -101,8 +102,8 @@ def _solved(capture: CaptureReconstructor, frames: CaptureFrames) -> CaptureReco
 
 def _refuse_other_pictures(options: ReconstructOptions, raws: Sequence[Source]) -> None:
     """Raise SettingError for too many raws, options that only one raw has, or an output that is a raw."""
-    if len(raws) > MOST_FRAMES:
-        raise SettingError(f"{len(raws)} raws are no burst", f"Give 2 to {MOST_FRAMES} raws of one eye in one light.")
+    if len(raws) > MAX_FRAMES:
+        raise SettingError(f"{len(raws)} raws are no burst", f"Give 2 to {MAX_FRAMES} raws of one eye in one light.")
     if options.sweep is not None or options.even:
         raise SettingError(
             "the picture of several frames is not evened out, and has no sweep", "Leave --even and --sweep out."

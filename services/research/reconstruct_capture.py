@@ -150,8 +150,10 @@ class CaptureReconstructor:
         planner: Planner | None = None,
         of_colours: Mapping[Colour, ReconstructOptions] | None = None,
     ) -> None:
-        self._options, self._planner = options, planner or Planner(options.plans)
-        self._single, self._of_colours = FileReconstructor(options, self._planner), of_colours or {}
+        self._options = options
+        self._planner = planner or Planner(options.plans)
+        self._single = FileReconstructor(options, self._planner)
+        self._of_colours = of_colours or {}
         self._plans: OrderedDict[tuple[object, ...], _CaptureSolvers] = OrderedDict()
 
     def __call__(self, frames: CaptureFrames) -> CaptureReconstruction:
@@ -175,7 +177,8 @@ class CaptureReconstructor:
 
     def solve(self, loaded: LoadedCapture) -> CaptureReconstruction:
         """Return the picture of a loaded capture; FrameError for frames that cannot be solved."""
-        frames, common = loaded.frames, loaded.common
+        frames = loaded.frames
+        common = loaded.common
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
         lit = [without_unknown(without_bad(one.raw), dark)[0] for one in loaded.lit]
         others = {
@@ -230,7 +233,8 @@ class CaptureReconstructor:
 
     def _reported(self, made: Reconstruction, loaded: LoadedCapture) -> CaptureReconstruction:
         """Return the result with the report of a file; FrameError for a picture without signal."""
-        plan, frames = loaded.plan, made.report.frames
+        plan = loaded.plan
+        frames = made.report.frames
         if NO_SIGNAL in made.report.warnings:
             raise FrameError(
                 f"{loaded.lit[0].name} holds no signal above the black level", "Give frames taken with light."
@@ -293,8 +297,12 @@ class _CaptureSolvers:
         planner: Planner,
         index: int,
     ) -> None:
-        self._budget_s, self._clock, self._light = options.budget_s, SystemClock(), frames.light or "green"
-        self._timed, self._planner, shape = self._budget_s is not None, planner, reference.psfs[0].pixels.shape
+        self._budget_s = options.budget_s
+        self._clock = SystemClock()
+        self._light = frames.light or "green"
+        self._timed = self._budget_s is not None
+        self._planner = planner
+        shape = reference.psfs[0].pixels.shape
         self.single = plan_reconstructor(options, reference, shape, planner, index, quick=len(frames.lit) > 1)
         self._lit = self._of_frames(self.single, len(frames.lit))
         like_first = replace(options, bin=self.single.stages[-1].recipe.bin)

@@ -38,7 +38,9 @@ def reconstruct_each(
     reconstruct = FileReconstructor(replace(options, raw=raws[0], output=None, report=None))
     for one in (folder, *([] if reports is None else [reports])):
         _make_folder(one)
-    clock, failed, noted = SystemClock(), 0, set[str]()
+    clock = SystemClock()
+    failed = 0
+    noted = set[str]()
     begin_s = first_s = clock.now_s()
     for number, (raw, place) in enumerate(zip(raws, places, strict=True), 1):
         try:

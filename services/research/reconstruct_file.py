@@ -53,9 +53,9 @@ from services.research.reconstruct_inputs import (
 )
 
 ENDINGS = (".npy", ".tif", ".tiff", ".png")
-LEAST_SAMPLES = 16  # of the shorter side
-MOST_ROUNDS = 100_000
-MOST_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
+MIN_SAMPLES = 16  # of the shorter side
+MAX_ROUNDS = 100_000
+MAX_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
 ONCE = "FFTW_ESTIMATE"  # plans of one picture: to measure them takes longer than the picture. Measured ones are used
 KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up to about 300 MB at full sensor size
 
@@ -125,7 +125,8 @@ class FileReconstructor:
 
     def __init__(self, options: ReconstructOptions, planner: Planner | None = None) -> None:
         refuse_invalid(options)
-        self._options, self._planner = options, planner or Planner(options.plans)
+        self._options = options
+        self._planner = planner or Planner(options.plans)
         self._psfs: dict[tuple[Shape, int, str | None], LoadedPsfs | None] = {}
         self._plans: OrderedDict[tuple[object, ...], _FrameSolvers] = OrderedDict()
         self._last: _FrameSolvers | None = None
@@ -155,7 +156,8 @@ class FileReconstructor:
             )
         of_psfs = () if psfs is None else psfs.notes
         notes = (*loaded.notes, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
-        warnings, swapped = made.report.warnings, () if psfs is None else swap_notes(loaded, psfs)
+        warnings = made.report.warnings
+        swapped = () if psfs is None else swap_notes(loaded, psfs)
         if swapped:  # the reason why the PSF does not match
             warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())
         report = replace(made.report, warnings=(*warnings, *swapped, *notes))
@@ -166,7 +168,8 @@ class FileReconstructor:
         """Return the last picture with the `even` correction, if the options have it."""
         if not self._options.even or self._last is None:
             return picture
-        calibration, shape = self._last.calibrations[0], (picture.shape[0], picture.shape[1])
+        calibration = self._last.calibrations[0]
+        shape = (picture.shape[0], picture.shape[1])
         if self._last.is_mosaic and calibration.geometry is not None:  # of a plane, which has half the pixels
             geometry = replace(calibration.geometry, pitch_um=calibration.geometry.pitch_um / 2)
             calibration = replace(calibration, geometry=geometry)
@@ -215,7 +218,10 @@ class _FrameSolvers:
         is_mosaic: bool,
     ) -> None:
         self.calibrations, self.is_mosaic = calibrations, is_mosaic
-        self._options, self.shape, self._planner, self._clock = options, shape, planner, SystemClock()
+        self._options = options
+        self.shape = shape
+        self._planner = planner
+        self._clock = SystemClock()
         self._solvers: dict[int, tuple[Reconstructor, ...]] = {}
         if options.sweep is not None and len(calibrations[0].psfs) < 2:
             raise SettingError("a sweep compares several PSFs", "Give --psf more than once, or leave --sweep out.")
@@ -225,7 +231,8 @@ class _FrameSolvers:
 
         `dark` is its own dark frame, (rows, cols), or of a mosaic (rows, cols, 3).
         """
-        options, pixels = self._options, loaded.raw.pixels
+        options = self._options
+        pixels = loaded.raw.pixels
         index = self._most_likely_psf(loaded)
         if index not in self._solvers:
             self._solvers[index] = self._planned(index)
@@ -259,10 +266,12 @@ class _FrameSolvers:
 
     def _most_likely_psf(self, loaded: LoadedRaw) -> int:
         """Return the index of the most likely PSF of a stack, by the brightest channel; draw the sweep plot."""
-        pixels, calibration = loaded.raw.pixels, self.calibrations[0]
+        pixels = loaded.raw.pixels
+        calibration = self.calibrations[0]
         if len(self.calibrations) > 1:
             c = _brightest(pixels)
-            pixels, calibration = plane(pixels, c), self.calibrations[c]
+            pixels = plane(pixels, c)
+            calibration = self.calibrations[c]
         index, scores = most_likely_psf(calibration, pixels, self._planner)
         if self._options.sweep is not None:
             _draw_sweep(self._options.sweep, loaded.name, calibration, scores)
@@ -283,7 +292,7 @@ def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tup
             "is lit, give the head (--head), or use the method 'open'."
         )
     residual = report.residual or 0.0
-    if residual > MOST_RESIDUAL and not notes and not set(MISMATCHES.values()) & set(report.warnings):
+    if residual > MAX_RESIDUAL and not notes and not set(MISMATCHES.values()) & set(report.warnings):
         found.append(
             f"The residual is {residual:.1f} times the noise, and about 1 where the PSF explains the frame: parts "
             "of the picture may be false."
@@ -391,7 +400,7 @@ def _recipes(
     quick, full = default_schedule(calibration, shape, index)
     method = METHODS[full.method] if wanted is None else wanted
     n = options.bin or (1 if method.periodic else full.bin)
-    most = max(1, min(shape) // LEAST_SAMPLES)
+    most = max(1, min(shape) // MIN_SAMPLES)
     if not 1 <= n <= most:
         raise SettingError(
             f"a bin of {n} leaves {shape[0] // n} x {shape[1] // n} samples of a frame of {shape[0]} x {shape[1]}",
@@ -418,8 +427,8 @@ def refuse_invalid(options: ReconstructOptions) -> None:
         Deadline.after(SystemClock(), options.budget_s)  # raises SettingError for an invalid time
     if options.bin is not None and options.bin < 1:
         raise SettingError(f"a bin of {options.bin} holds no pixel", "Give --bin from 1: it is pixels per sample.")
-    if options.rounds is not None and not 1 <= options.rounds <= MOST_ROUNDS:
-        raise SettingError(f"{options.rounds} rounds cannot be run", f"Give --rounds from 1 to {MOST_ROUNDS}.")
+    if options.rounds is not None and not 1 <= options.rounds <= MAX_ROUNDS:
+        raise SettingError(f"{options.rounds} rounds cannot be run", f"Give --rounds from 1 to {MAX_ROUNDS}.")
     _refuse_outputs(options)
 
 

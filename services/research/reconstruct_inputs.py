@@ -34,7 +34,7 @@ from device.optics.lit_field import picture_field_deg
 from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels
-from device.recon.model.preprocessing import MOST_BAD
+from device.recon.model.preprocessing import MAX_BAD
 from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
 from services.imaging.picture_files import read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
@@ -42,7 +42,7 @@ from services.imaging.raw_metadata import RawMetadata
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
 RawSource = Source | Raw  # or counts that are read
 Shape = tuple[int, int]
-MOST_EQUAL = 0.9  # share of a raw's pixels that may have its maximum: with more, the others are too few to show noise
+MAX_EQUAL = 0.9  # share of a raw's pixels that may have its maximum: with more, the others are too few to show noise
 SWAPPED = 1.1  # ratio of `concentration`, raw over PSF: recordings have 0.56 to 0.85, swapped 1.18 to 1.80
 
 
@@ -178,14 +178,15 @@ def _read(source: RawSource, name: str) -> ImageFile:
 def refuse_without_signal(raw: Raw, name: str) -> None:
     """Raise FrameError for a frame without usable values, with too many saturated pixels, or with equal values only."""
     unusable = float(raw.bad.mean())
-    if unusable > MOST_BAD:
+    if unusable > MAX_BAD:
         raise FrameError(
             f"{name}: {unusable:.0%} of the frame cannot be used, because its values are not numbers",
             "Save the frame again without NaN or infinite values.",
         )
     pixels = raw.pixels if raw.pixels.ndim == 2 else raw.pixels.max(axis=2)
-    saturated, equal = float((pixels >= raw.white_dn).mean()), float((pixels == pixels.max()).mean())
-    if saturated > MOST_BAD or MOST_EQUAL < equal < 1:
+    saturated = float((pixels >= raw.white_dn).mean())
+    equal = float((pixels == pixels.max()).mean())
+    if saturated > MAX_BAD or MAX_EQUAL < equal < 1:
         raise FrameError(
             f"{name} is saturated: {max(saturated, equal):.0%} of its pixels have the highest value, {pixels.max():g}",
             "Take the frame with a shorter exposure.",
@@ -349,7 +350,8 @@ def _for_three(stacks: tuple[tuple[Psf, ...], ...]) -> tuple[tuple[Psf, ...], ..
 
 def _of_mean_green(sensor: Sensor) -> Sensor:
     """Return the sensor whose counts are the mean of two pixels: twice the electrons per count."""
-    gain, noise = sensor.gain_e_per_dn, sensor.read_noise_e
+    gain = sensor.gain_e_per_dn
+    noise = sensor.read_noise_e
     return replace(
         sensor, gain_e_per_dn=None if gain is None else 2 * gain, read_noise_e=None if noise is None else noise * 2**0.5
     )
@@ -398,7 +400,8 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     folder, colon, id = ("", "", "") if Path(place).is_dir() else place.rpartition(":")
     archive = Archive(Path(folder if colon else place))
     kept = archive.load(id if colon else None)
-    found, raw = kept.calibration, loaded.raw
+    found = kept.calibration
+    raw = loaded.raw
     found = in_light(found, loaded.light, loaded.name)
     require_same_shape(found.psfs, loaded.solved_shape)
     known = "white_dn" not in kept.provenance.unknown
@@ -431,7 +434,7 @@ def companion(source: Source, what: str, loaded: LoadedRaw, above_black: bool = 
     """Return a dark or flat frame in the counts of its raw frame, divided by `2**raw.shift`; NaN where it is saturated.
 
     (rows, cols), with colours averaged; of a mosaic the planes, (rows, cols, 3). `above_black`: the black level that
-    its file states is subtracted. FrameError for one that is saturated in more than MOST_BAD of its pixels, or has
+    its file states is subtracted. FrameError for one that is saturated in more than MAX_BAD of its pixels, or has
     another shape.
     """
     name = name_of(source, what)
@@ -447,7 +450,7 @@ def companion(source: Source, what: str, loaded: LoadedRaw, above_black: bool = 
             "Use files of one and the same camera mode.",
         )
     saturated = float(np.isnan(pixels).mean())
-    if saturated > MOST_BAD:
+    if saturated > MAX_BAD:
         raise FrameError(
             f"{name} is saturated: {saturated:.0%} of its pixels have the highest value",
             "Take it with a shorter exposure.",

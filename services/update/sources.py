@@ -121,7 +121,8 @@ class UpdateServer:
         A complete file of an earlier download is returned as it is. UpdateUnreachable after the last try (the received
         part stays), UpdateNoRoom, UpdateDamaged (the file is removed).
         """
-        whole, part = folder / DOWNLOADED_BUNDLE, folder / f"{offer.bundle}.part"
+        whole = folder / DOWNLOADED_BUNDLE
+        part = folder / f"{offer.bundle}.part"
         resumed = part.exists()
         for old in folder.glob("*.part"):
             if old != part:
@@ -162,7 +163,8 @@ class UpdateServer:
     def _open(self, name: str, there: int) -> Iterator[httpx.Response]:
         """Request a file from byte `there` on; httpx.HTTPStatusError for an error status (400 or above)."""
         headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={there}-"} if there else {})
-        url, timeout = f"{self._at}/{name}", READ_TIMEOUT_S  # https only: UpdateSettings
+        url = f"{self._at}/{name}"  # https only: UpdateSettings
+        timeout = READ_TIMEOUT_S
         with (
             httpx.Client(verify=self._trust, timeout=timeout, follow_redirects=True) as client,
             client.stream("GET", url, headers=headers) as answer,

@@ -58,7 +58,8 @@ def describe_state(entry: UpdateState, runs: str, is_trying: bool, under_way: bo
 
     `is_trying`: the running version is not committed. `under_way`: another process is fetching or installing now.
     """
-    text, trouble = f"Version {runs} runs.", entry.trouble
+    text = f"Version {runs} runs."
+    trouble = entry.trouble
     why = f"{trouble.message} {trouble.remedy}" if trouble else ""
     if is_trying:
         return f"Version {runs} is being tried; {entry.before or 'the version before'} is back if it does not do."

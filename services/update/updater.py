@@ -31,7 +31,8 @@ class Updater:
     ) -> None:
         self._settings, self._clock, self._report = settings, clock, report
         self._chooser = chooser or BootChooser(state=settings.folder)
-        self._rauc, self._journal = Rauc(settings.rauc), StateFile(settings.folder)
+        self._rauc = Rauc(settings.rauc)
+        self._journal = StateFile(settings.folder)
         self.running_version = runs or version("diffuscope")
         self._available = AvailableUpdates(settings, clock, self._rauc, self.running_version)
         self._reported = (-1, "")
@@ -111,7 +112,8 @@ class Updater:
         preconditions.refuse_while_trying(self._chooser)
         with preconditions.update_lock(settings.folder), self._journal.record_refusals():
             preconditions.refuse_old_bootloader(settings.bootloader)
-            ill, begin_s = self._at_rest(), self._clock.now_s()
+            ill = self._at_rest()
+            begin_s = self._clock.now_s()
             sources.remove_copy(settings.folder)
             self._journal.write(state="fetching", version="", before=self.running_version, share=0.0, ill=ill)
             bundle = fetch()

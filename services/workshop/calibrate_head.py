@@ -54,7 +54,8 @@ def calibrate(
 
 def measured_values(kept: StoredCalibration) -> tuple[str, str]:
     """Return two lines with the measured values of the sensor and the other figures of a calibration."""
-    sensor, figures = kept.calibration.sensor, ", ".join(f"{k} {v:.3g}" for k, v in kept.provenance.figures)
+    sensor = kept.calibration.sensor
+    figures = ", ".join(f"{k} {v:.3g}" for k, v in kept.provenance.figures)
     return (
         f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN",
         f"read noise {sensor.read_noise_e:.2f} e-, {figures}",
@@ -68,7 +69,8 @@ def calibrate_on(
 
     After a power cut before that write, the instrument refuses to start and names the command that writes the memory.
     """
-    job, work = calibration_job(bench, spec, request, operator.show_message), request.archive / STEPS_FOLDER
+    job = calibration_job(bench, spec, request, operator.show_message)
+    work = request.archive / STEPS_FOLDER
     procedure = CalibrationSequence(job, bench.camera, operator, clock, work, bench.chips.thermometer)
     archive = Archive(request.archive)
     kept = archive.load(procedure.run(archive))

@@ -75,7 +75,8 @@ def _put_in_force(archive: Archive, id: str, head: Path | None) -> str:
     If the second write fails, the instrument refuses to start and names this command.
     """
     with ExitStack() as stack:
-        found, memory = archive.load(id), None
+        found = archive.load(id)
+        memory = None
         if head is not None:
             spec = load_head(head)
             refuse_unsuitable_calibration(found, spec)
@@ -148,7 +149,8 @@ def export_one(
     if len(words) > 2:
         raise typer.BadParameter("give one calibration and one file")
     kept = Archive(archive)
-    id, file = words[0] if len(words) == 2 else kept.active_id(), Path(words[-1])
+    id = words[0] if len(words) == 2 else kept.active_id()
+    file = Path(words[-1])
     signer = export(kept.files(id), file, key)
     typer.echo(f"{file}: {id}, signed by {signer.name}, key {signer.fingerprint[:16]}")
 
@@ -166,7 +168,8 @@ def import_one(
     from device.calibration.signing import read_export, read_signer
 
     files, signer = read_export(file, tuple(read_signer(path) for path in trust))
-    found, kept = parse_calibration(files), Archive(archive)
+    found = parse_calibration(files)
+    kept = Archive(archive)
     if head is not None:
         spec = load_head(head)
         refuse_unsuitable_calibration(found, spec)

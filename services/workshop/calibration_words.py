@@ -11,7 +11,8 @@ def printable(text: str) -> str:
 
 def summary(kept: StoredCalibration) -> tuple[str, ...]:
     """Return two or three lines: ID, date, serial number, temperature and technician; measured values; warnings."""
-    found, provenance = kept.calibration, kept.provenance
+    found = kept.calibration
+    provenance = kept.provenance
     warm = "-" if provenance.temperature_c is None else f"{provenance.temperature_c:.1f} C"
     first = (
         f"{found.id}  {provenance.made_at:%Y-%m-%d %H:%M}  {printable(provenance.serial):<12}  {warm:>7}"
@@ -22,7 +23,8 @@ def summary(kept: StoredCalibration) -> tuple[str, ...]:
 
 def details(kept: StoredCalibration) -> tuple[str, ...]:
     """Return the values that `summary` omits, one line each, and the list of unknown ones."""
-    found, provenance = kept.calibration, kept.provenance
+    found = kept.calibration
+    provenance = kept.provenance
     lines = [
         ("software", printable(provenance.software)),
         ("geometry", _geometry(found.geometry)),
@@ -52,7 +54,8 @@ def _white(white: WhiteReference | None) -> str:
 
 
 def _numbers(kept: StoredCalibration) -> str:
-    found, unknown = kept.calibration, kept.provenance.unknown
+    found = kept.calibration
+    unknown = kept.provenance.unknown
     sensor = found.sensor
     black = "unknown" if "black_dn" in unknown else f"{sensor.black_dn:.2f} DN"
     white = "unknown" if "white_dn" in unknown else f"{sensor.white_dn:.0f} DN"
@@ -67,7 +70,8 @@ def _psfs(found: Calibration) -> str:
 
 
 def _warnings(kept: StoredCalibration) -> tuple[str, ...]:
-    provenance, notes = kept.provenance, []
+    provenance = kept.provenance
+    notes = []
     if kept.calibration.simulated:
         notes.append("SIMULATED")
     if provenance.origin == "imported":

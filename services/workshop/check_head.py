@@ -112,7 +112,8 @@ def _psf_check(spec: InstrumentSpec, calibration: Calibration) -> PsfMatchTest |
 
 
 def _sights_of_darks(spec: InstrumentSpec, kept: StoredCalibration, clock: Clock) -> list[CaptureAssessment]:
-    exposure_s, sights = spec.camera.exposure_s, []
+    exposure_s = spec.camera.exposure_s
+    sights = []
     with closing(open_bench(spec, clock)) as bench:
         _refuse_another_head(bench, kept)
         bench.camera.prepare(ExposureSettings(exposure_s))

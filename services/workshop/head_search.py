@@ -117,13 +117,15 @@ def _candidate(
     if inner_mm <= reflex_free_mm(design.optics.field_deg / 2) or design.relay.pupil_margin_mm(design.pupil_mm) < 0:
         return None
     whole = replace(design, led=replace(choice.led, power_mw=leds * choice.led.power_mw))
-    one, all_of_them = expected_beam(design), expected_beam(whole)
+    one = expected_beam(design)
+    all_of_them = expected_beam(whole)
     shares = limit_shares(design, replace(all_of_them, waist_w_per_cm2=one.waist_w_per_cm2), limits)
     level = permitted_level(shares)
     factors = chain(whole, level, frames)
     if whole.share_in_pupil <= 0.5:
         return None
-    electrons, worst = product(factors), max(shares, key=lambda share: share.used)
+    electrons = product(factors)
+    worst = max(shares, key=lambda share: share.used)
     return Candidate(
         choice,
         leds,

@@ -17,7 +17,8 @@ STYLE_HERE = """
 SCALE, CLOSE = 5.0, 25.0  # pixels per millimetre of the drawing and of the enlargement
 WIDE, TALL = 1180, 870
 LEFT, AXIS, CLOSE_LEFT, CLOSE_AXIS = 180.0, 280.0, 190.0, 670.0
-TOP, ROWS = 128.0, 5  # y of the lowest row of labels in px, and the number of rows above
+TOP = 128.0  # y of the lowest row of labels in px, and the number of rows above
+ROWS = 5
 
 
 def draw_light_path(design: Design) -> str:
@@ -41,11 +42,15 @@ def _stroke(kind: str, *places: Place) -> str:
 
 
 def _parts(design: Design, budget: OpticalBudget) -> list[str]:
-    relay, path = design.relay, design.path.relay
+    relay = design.relay
+    path = design.path.relay
     first, second, iris, sensor = planes_mm(relay)
-    plate, half, lens = iris - path.splitter_to_iris_mm, path.splitter_mm / 2**1.5, path.lens_mm / 2
+    plate = iris - path.splitter_to_iris_mm
+    half = path.splitter_mm / 2**1.5
+    lens = path.lens_mm / 2
     board = design.chain.pitch_mm * design.chain.cols / 2
-    long, pupil = budget.long.sensor_mm / 2, design.pupil_mm / 2
+    long = budget.long.sensor_mm / 2
+    pupil = design.pupil_mm / 2
     x, y = _at((-design.eye_mm / 2, 0))
     return [
         f'<circle class="part" cx="{x:.1f}" cy="{y:.1f}" r="{SCALE * design.eye_mm / 2:.1f}"/>',
@@ -77,18 +82,22 @@ def _lens(at_mm: float, half_mm: float) -> str:
 
 def _distances(design: Design) -> list[str]:
     """Return the dimension lines below the parts: pupil to first lens, second lens, iris; lengths in mm."""
-    y, marks = AXIS + 170, (0.0, *planes_mm(design.relay)[:3])
+    y = AXIS + 170
+    marks = (0.0, *planes_mm(design.relay)[:3])
     out = []
     for start, end in pairwise(marks):
-        a, b = _at((start, 0))[0], _at((end, 0))[0]
+        a = _at((start, 0))[0]
+        b = _at((end, 0))[0]
         out += [line(a, y, b, y, "frame"), *(line(x, y - 5, x, y + 5, "frame") for x in (a, b))]
         out.append(text((a + b) / 2, y + 18, f"{end - start:g} mm", "small", "middle"))
     return out
 
 
 def _rays(design: Design) -> list[str]:
-    relay, half_deg = design.relay, design.optics.field_deg / 2
-    edge_mm, cone_deg = relay.iris_at_eye_mm / 2, relay.led_cone_deg(design.optics.field_deg) / 2
+    relay = design.relay
+    half_deg = design.optics.field_deg / 2
+    edge_mm = relay.iris_at_eye_mm / 2
+    cone_deg = relay.led_cone_deg(design.optics.field_deg) / 2
     out = []
     for kind, angle_deg in (("s1", 0.0), ("s3", half_deg), ("s2", -half_deg)):
         rays = (ray_mm(relay, design.eye_mm, height_mm, angle_deg) for height_mm in (-edge_mm, 0, edge_mm))
@@ -100,9 +109,11 @@ def _rays(design: Design) -> list[str]:
 
 def _part_labels(design: Design) -> list[tuple[Place, str]]:
     """Return for each part on the axis its top as (x, y) in mm, and the text of its label."""
-    relay, path = design.relay, design.path.relay
+    relay = design.relay
+    path = design.path.relay
     first, second, iris, sensor = planes_mm(relay)
-    plate, top = iris - path.splitter_to_iris_mm, -path.lens_mm / 2
+    plate = iris - path.splitter_to_iris_mm
+    top = -path.lens_mm / 2
     half = path.splitter_mm / 2**1.5
     return [
         ((-design.eye_mm / 2, -design.eye_mm / 2), f"eye, {design.eye_mm:g} mm"),
@@ -133,7 +144,8 @@ def _labels(named: list[tuple[Place, str]]) -> list[str]:
 
 
 def _box(x: float, row: int, anchor: str, words: str) -> Box:
-    wide, bottom = len(words) * LETTER_PX, TOP - row * (LINE_PX + 5)
+    wide = len(words) * LETTER_PX
+    bottom = TOP - row * (LINE_PX + 5)
     left = x - {"middle": wide / 2, "start": 0, "end": wide}[anchor]
     return left - 3, bottom - LINE_PX, left + wide + 3, bottom
 
@@ -147,9 +159,11 @@ def _enlargement(design: Design, budget: OpticalBudget) -> list[str]:
 
     Bars beside the sensor compare its two sides with the extent of the light.
     """
-    relay, half_deg = design.relay, design.optics.field_deg / 2
+    relay = design.relay
+    half_deg = design.optics.field_deg / 2
     iris, sensor = planes_mm(relay)[2:]
-    x, far = CLOSE_LEFT, CLOSE_LEFT + CLOSE * relay.diffuser_to_sensor_mm
+    x = CLOSE_LEFT
+    far = CLOSE_LEFT + CLOSE * relay.diffuser_to_sensor_mm
     out = [text(24, CLOSE_AXIS - 158, "From the iris to the sensor, five times larger")]
     for kind, angle_deg in (("s1", 0.0), ("s3", half_deg), ("s2", -half_deg)):
         edges = [ray_mm(relay, design.eye_mm, side * relay.iris_at_eye_mm / 2, angle_deg)[-2:] for side in (-1, 1)]

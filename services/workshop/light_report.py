@@ -81,12 +81,15 @@ def expected_beam(design: Design) -> Beam:
 
     The guard factor of a measured ring is in it.
     """
-    table, measured = design.radiometry, design.measured
+    table = design.radiometry
+    measured = design.measured
     if table is not None and measured is not None:
         scale = table.guard_factor / 1000
-        retina, waist = measured.retina_mw_per_cm2, measured.waist_mw_per_cm2
+        retina = measured.retina_mw_per_cm2
+        waist = measured.waist_mw_per_cm2
         return Beam(measured.wavelength_um, scale * retina, scale * waist, measured.fwhm_um)
-    scale, waist = GUARD / 1000, cornea_mw(chain(design)) / len(ring(design.chain)) / WAIST_CM2
+    scale = GUARD / 1000
+    waist = cornea_mw(chain(design)) / len(ring(design.chain)) / WAIST_CM2
     return Beam(design.led.wavelength_um, scale * design.highest_mw_per_cm2, scale * waist, LED_FWHM_UM)
 
 
@@ -96,7 +99,8 @@ def at_full_drive(design: Design, frames: int = 1) -> FullDrive:
     The share has those of the chain up to the cornea without the cone, which the intensity on the axis does not depend
     on, and of an unmeasured ring the wavelength's within a bin.
     """
-    factors, rng = chain(design, frames=frames), np.random.default_rng(0)
+    factors = chain(design, frames=frames)
+    rng = np.random.default_rng(0)
     bright = [i for i, factor in enumerate(to_cornea(factors)) if factor.name != CONE]
     spreads = np.array([factor.spread for factor in factors])
     logs = rng.standard_normal((DRAWS, len(factors))) * spreads
@@ -133,7 +137,8 @@ def unmeasured_beam(design: Design) -> Beam:
 
 def limit_shares(design: Design, beam: Beam, limits: Limits) -> tuple[LimitShare, ...]:
     """Return the three irradiance limits with what a beam gives at full drive."""
-    hazard, full = Hazard({design.colour: beam}, limits), Illumination(design.colour)
+    hazard = Hazard({design.colour: beam}, limits)
+    full = Illumination(design.colour)
     return (
         LimitShare(
             "photochemical", 1e6 * hazard.photochemical_w_per_cm2(full), 1e6 * limits.photochemical_w_per_cm2, "uW/cm2"
@@ -161,7 +166,8 @@ def _peak_e(electrons_per_cell: float) -> float:
 def table(design: Design, frames: int = 1) -> str:
     """Return chain, uncertainty, limits, permitted drive and gains of a design as text; errors as `refuse_dark`."""
     refuse_dark(design)
-    factors, limits = chain(design, frames=frames), light_limits()
+    factors = chain(design, frames=frames)
+    limits = light_limits()
     return "\n".join(
         [
             f"{design.title}: {design.colour}, {frames} frame(s) of {1000 * design.exposure_s:g} ms, "
@@ -184,7 +190,8 @@ def _chain_lines(design: Design, factors: tuple[Factor, ...], frames: int) -> li
         f"{one.name:<26}{one.value:>10.4g} {one.unit:<5}{one.spread:>8.2f}  {one.cause:<11}{one.source}"
         for one in factors
     ]
-    spread, small = simulated(factors), product(chain(replace(design, pupil_mm=SMALL_PUPIL_MM), frames=frames))
+    spread = simulated(factors)
+    small = product(chain(replace(design, pupil_mm=SMALL_PUPIL_MM), frames=frames))
     return [
         *lines,
         f"{'product':<26}{product(factors):>10.0f} e-   90 % of draws: {spread.low:.0f} to {spread.high:.0f}, with a "
@@ -224,7 +231,8 @@ def _half_period(design: Design, electrons: float) -> str:
 
 def _build_lines(design: Design, frames: int) -> list[str]:
     found = at_full_drive(design, frames)
-    share, electrons = found.share, found.electrons
+    share = found.share
+    electrons = found.electrons
     return [
         f"photochemical limit at full drive, as expected: 90 % of builds use {100 * share.low:.0f} to "
         f"{100 * share.high:.0f} %, {100 * found.no_go:.0f} % of builds are NO GO",
@@ -236,7 +244,8 @@ def _build_lines(design: Design, frames: int) -> list[str]:
 
 def _edge_lines(design: Design, limits: Limits) -> list[str]:
     """Return how the light falls towards the field's edge, and the tolerances."""
-    cap, magnification = design.cap, design.relay.angular_magnification
+    cap = design.cap
+    magnification = design.relay.angular_magnification
     shares = relative_irradiance(cap, magnification, EDGE_DEG)
     used = limit_shares(design, expected_beam(design), limits)[0].used
     return [
@@ -266,7 +275,9 @@ def gains_svg(design: Design, frames: int = 1) -> str:
     refuse_dark(design)
     factors = chain(design, frames=frames)
     gains = {cause: gain for cause, gain in possible_gains(factors).items() if gain > 1}
-    spread, scale, y = simulated(factors), (WIDE - LEFT - 70) / log10(100), 92.0
+    spread = simulated(factors)
+    scale = (WIDE - LEFT - 70) / log10(100)
+    y = 92.0
     light = f"{spread.median:.0f} electrons in a cell of 10 um, 90 % between {spread.low:.0f} and {spread.high:.0f}"
     parts = [
         text(16, 28, "Times more light if this were ideal", "title"),

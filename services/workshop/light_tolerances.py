@@ -39,7 +39,9 @@ def tolerances(design: Design, used: float, limits: Limits) -> tuple[Tolerance, 
     Together: the logarithms of the irradiances by the root of their summed squares, and the extreme fields. A measured
     ring has no tolerance of power and wavelength.
     """
-    cap, a, um = design.cap, design.relay.angular_magnification, design.led.wavelength_um
+    cap = design.cap
+    a = design.relay.angular_magnification
+    um = design.led.wavelength_um
     holes, heights, dies = (
         [replace(cap, **{key: getattr(cap, key) + way * slack}) for way in (-1, 1)]
         for key, slack in (("hole_mm", HOLE_MM), ("height_mm", HEIGHT_MM), ("emitter_mm", DIE_SHARE * cap.emitter_mm))

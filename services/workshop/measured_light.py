@@ -23,7 +23,7 @@ from services.workshop.light_report import (
 )
 
 PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
-MOST_OF_BEAM = 1.3  # in the waist's disc, of the beam by the reading on the axis: the error of two readings
+MAX_OF_BEAM = 1.3  # in the waist's disc, of the beam by the reading on the axis: the error of two readings
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _refuse_implausible(reading: MeterReading, wavelength_um: float, unmeasured:
             "the head file.",
         )
     beam_mw = cornea_mw(chain(unmeasured)) * reading.axis_uw / usual_uw
-    if reading.waist_mw_per_cm2 * WAIST_CM2 > MOST_OF_BEAM * beam_mw:
+    if reading.waist_mw_per_cm2 * WAIST_CM2 > MAX_OF_BEAM * beam_mw:
         raise SettingError(
             f"{reading.waist_mw_per_cm2:g} mW/cm2 over a disc of 1 mm are more than the {beam_mw:.2g} mW of the whole "
             f"beam, by {reading.axis_uw:g} uW on the axis",

@@ -40,12 +40,12 @@ FILL_SHARE = 0.5  # of the full well, that the brightest pixel is to reach
 SEEN_PX_PER_DEG = 8.0  # of the expected light of the field
 WIDER = 1.2  # of the promised field: room for a field that is larger than promised
 RESOLVED = 0.2  # least modulation of resolved bars; 0.15 is Rayleigh's dip of 26 %, as contrast
-LEAST_AGREEMENT = 0.5  # 0.95 in a good picture, 0.78 at 170 electrons per pixel of 5.04 um, 0.06 in noise
+MIN_AGREEMENT = 0.5  # 0.95 in a good picture, 0.78 at 170 electrons per pixel of 5.04 um, 0.06 in noise
 BARS_OVER_FORMULA = 0.6  # resolved period over that of the formula, which is of vessels: 0.46 to 0.6 in simulation
 SCALE_TOLERANCE, FIELD_TOLERANCE, STEP, GREY_TOLERANCE = 0.025, 0.05, 1.27, 0.15
 PAPER_SPREAD = 0.1  # of ln of the reflectance of printing paper (an estimate)
 TWO_SIDED_95 = 1.96  # standard deviations
-MOST_SATURATED = 0.01
+MAX_SATURATED = 0.01
 REASONS = {
     "resolution": "one step of the chart; OPTICS.md 4.3 for this light, and bars of full contrast (simulated)",
     "scale": "lens 25.0 or 25.2 mm (0.8 %), print (0.5 %), diffuser to sensor 6.0 +- 0.05 mm (0.8 %)",
@@ -147,7 +147,8 @@ def promise_of(spec: InstrumentSpec, exposure_s: float) -> Promise:
         for factor in chain(white)
     ]
     factor = exp(TWO_SIDED_95 * log_sd(factors))
-    cap, magnification = cap_of(spec), design.relay.angular_magnification
+    cap = cap_of(spec)
+    magnification = design.relay.angular_magnification
     seen_deg = field_deg if cap is None else seen_field_deg(cap, magnification)
     most_deg = field_deg if cap is None else dark_deg(cap, magnification)
     return Promise(
@@ -228,7 +229,7 @@ def check_model_eye(head: Path, frame: ModelEyeFrame) -> ModelEyeResult:
     wide_deg = min(max(WIDER * promise.field_deg, promise.dark_deg), 120.0)
     wide = reconstruct_file(replace(options, field_deg=wide_deg)).picture
     fit = fit_chart(wide, promise.px_per_deg, promise.field_deg)
-    if fit.agreement < LEAST_AGREEMENT:
+    if fit.agreement < MIN_AGREEMENT:
         raise FrameError(
             f"there is no chart of the model eye in this frame (agreement {fit.agreement:.2f} of 1)",
             "Put the chart into the model eye, ink towards the lens, with one step ring; light it, and keep its pupil "
@@ -274,14 +275,15 @@ def as_json(found: ModelEyeResult) -> str:
 def _electrons(spec: InstrumentSpec, frame: ModelEyeFrame, promise: Promise) -> tuple[float, float]:
     """Return mean over the lit disc and peak of the frame's electrons; FrameError if too dark or saturated."""
     loaded = load_raw(frame.raw)
-    camera, pixels = spec.camera, np.asarray(loaded.raw.pixels, np.float64)
+    camera = spec.camera
+    pixels = np.asarray(loaded.raw.pixels, np.float64)
     if pixels.shape != (camera.rows, camera.cols):
         raise FrameError(
             f"{loaded.name} has {' x '.join(map(str, pixels.shape))} values, the head {camera.rows} x {camera.cols}",
             "Give a monochrome frame of this head in its own mode.",
         )
     saturated = float((pixels >= min(camera.white_dn, loaded.raw.white_dn)).mean())
-    if saturated > MOST_SATURATED:
+    if saturated > MAX_SATURATED:
         raise FrameError(
             f"{loaded.name} is too bright: {saturated:.0%} of its pixels are saturated",
             f"Take it with a shorter exposure than {1000 * frame.exposure_s:g} ms.",
@@ -334,13 +336,15 @@ def _scale(fit: ChartFit, promise: Promise) -> Row:
 
 
 def _field(wide: Image, fit: ChartFit, promise: Promise) -> Row:
-    measured, field = lit_diameter_px(wide, fit.px_per_deg) / fit.px_per_deg, promise.seen_field_deg
+    measured = lit_diameter_px(wide, fit.px_per_deg) / fit.px_per_deg
+    field = promise.seen_field_deg
     return _row("field", measured, field, field * (1 - FIELD_TOLERANCE), field * (1 + FIELD_TOLERANCE), "deg")
 
 
 def light_row(mean_e: float, promise: Promise) -> Row:
     """Return the figure of the light: mean electrons of a pixel of the lit disc against the promise."""
-    light, factor = promise.lit_e, promise.light_factor
+    light = promise.lit_e
+    factor = promise.light_factor
     return _row("light", mean_e, light, light / factor, light * factor, "e-/pixel")
 
 

@@ -45,7 +45,8 @@ class ChartFit:
         height = np.hypot(right_um, down_um)
         angle = np.degrees(np.arctan(height / (1000 * retina_chart.EYE_MM)))
         per_um = self.px_per_deg * np.where(height > 0, angle / np.maximum(height, 1e-9), 0)
-        x, y = right_um * per_um, down_um * per_um
+        x = right_um * per_um
+        y = down_um * per_um
         turn = radians(self.turn_deg)
         return self.row + x * sin(turn) + y * cos(turn), self.col + x * cos(turn) - y * sin(turn)
 
@@ -57,7 +58,8 @@ def fit_chart(picture: Image, px_per_deg: float, field_deg: float) -> ChartFit:
     `agreement` is the correlation coefficient within the first ring or the field: 0 without a chart.
     """
     n = max(1, int(px_per_deg / SAMPLES_PER_DEG))
-    small, per_deg = _reduced(picture, px_per_deg, field_deg, n), px_per_deg / n
+    small = _reduced(picture, px_per_deg, field_deg, n)
+    per_deg = px_per_deg / n
     radius_deg = min(RADIUS_DEG, field_deg / 2 - FIELD_MARGIN_DEG)
     start = _coarse(small, per_deg, radius_deg)
     steps = np.array([0.5, 0.5, 0.02, 3.0])
@@ -96,7 +98,8 @@ def modulation(picture: Image, fit: ChartFit, group: BarGroup) -> float:
 
     Paper and ink are measured on the patches of the chart.
     """
-    paper, ink = patch(picture, fit, retina_chart.PAPER_PATCH), patch(picture, fit, retina_chart.INK_PATCH)
+    paper = patch(picture, fit, retina_chart.PAPER_PATCH)
+    ink = patch(picture, fit, retina_chart.INK_PATCH)
     if paper <= ink:
         return 0.0
     along = np.linspace(-0.4, 0.4, 25) * group.side_um
@@ -148,9 +151,11 @@ def _reduced(picture: Image, px_per_deg: float, field_deg: float, n: int) -> Ima
 def _expected(shape: Iterable[int], trial: ChartFit, radius_deg: float) -> tuple[Image, Image]:
     """Return the expected picture (paper 1) and the mask of its compared part, both float32 (rows, cols)."""
     rows, cols = (np.arange(size, dtype=np.float32) for size in shape)
-    x, y = (cols - np.float32(trial.col))[None, :], (rows - np.float32(trial.row))[:, None]
+    x = (cols - np.float32(trial.col))[None, :]
+    y = (rows - np.float32(trial.row))[:, None]
     turn = radians(trial.turn_deg)
-    right, down = x * cos(turn) + y * sin(turn), y * cos(turn) - x * sin(turn)
+    right = x * cos(turn) + y * sin(turn)
+    down = y * cos(turn) - x * sin(turn)
     angle = np.hypot(right, down) / np.float32(trial.px_per_deg)
     stretch = 1000 * retina_chart.EYE_MM * np.tan(np.radians(np.minimum(angle, 60)))
     per_px = stretch / np.maximum(angle * np.float32(trial.px_per_deg), 1e-6)
@@ -167,7 +172,8 @@ def _agreement(small: Image, trial: ChartFit, radius_deg: float) -> float:
     """Return the correlation coefficient of picture and expected picture within the mask."""
     plane, mask = _expected(small.shape, trial, radius_deg)
     inside = mask > 0
-    seen, wanted = small[inside], plane[inside]
+    seen = small[inside]
+    wanted = plane[inside]
     if inside.sum() < 100 or seen.std() == 0:
         return 0.0
     return float(np.corrcoef(seen, wanted)[0, 1])
@@ -184,7 +190,8 @@ def _coarse(small: Image, px_per_deg: float, radius_deg: float) -> ChartFit:
         found: Image = fft.irfft2(spectrum * np.conj(fft.rfft2(drawn, size)), size)[window]
         return found
 
-    seen, squared = fft.rfft2(small, size), fft.rfft2(small**2, size)
+    seen = fft.rfft2(small, size)
+    squared = fft.rfft2(small**2, size)
     best = ChartFit(middle[0], middle[1], px_per_deg, 0.0, -1.0)
     for scale in SCALES * px_per_deg:
         mask = _expected(small.shape, ChartFit(middle[0], middle[1], scale, 0.0, 0.0), radius_deg)[1]

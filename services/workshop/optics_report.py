@@ -92,7 +92,8 @@ def _eye(chosen: Design, budget: OpticalBudget) -> list[Row]:
     filled = f"the iris stays filled within {budget.filled_field_deg:.1f} deg"
     if budget.pupil_margin_mm < 0:
         filled = "this pupil never fills the iris"
-    iris, widest_mm = f"of a pupil of {chosen.pupil_mm:g} mm", widest_iris_mm(chosen)
+    iris = f"of a pupil of {chosen.pupil_mm:g} mm"
+    widest_mm = widest_iris_mm(chosen)
     if chosen.relay.iris_mm > widest_mm:
         iris += f"; TOO WIDE to be calibrated on this sensor, at most {widest_mm:.2f} mm at the diffuser"
     return [
@@ -142,7 +143,8 @@ def _extents(relay: Relay) -> list[str]:
     pitch_um = known_sensors()["quantalux"].pitch_um
     lines = [f"{'field deg':>9} {'object mm':>10} {'s mm':>7} {'d + 2s mm':>10} {'px':>5} {'ideal relay mm':>15}"]
     for field in FIELDS_DEG:
-        half_mm, width_mm = half_shift_mm(relay, field), extent_mm(relay, field)
+        half_mm = half_shift_mm(relay, field)
+        width_mm = extent_mm(relay, field)
         ideal_mm = relay.iris_mm + 2 * half_shift_tan_mm(relay, field)
         lines.append(
             f"{field:>9.1f} {size_mm(field, MODEL_EYE_MM):>10.3f} {half_mm:>7.4f} {width_mm:>10.3f}"

@@ -65,10 +65,13 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     """
     refuse_without_lamp(spec)
     spec = with_calibrated_light(spec)
-    design, hazard, colour = design_of(spec), hazard_of(spec), spec.light.colour
+    design = design_of(spec)
+    hazard = hazard_of(spec)
+    colour = spec.light.colour
     glow = hazard.brightest(colour) if level is None else Illumination(colour, level)
     hazard.refuse(glow)
-    limits, beam = hazard.limits, hazard.beams[colour]
+    limits = hazard.limits
+    beam = hazard.beams[colour]
     spectrum = beam.wavelength_um, beam.fwhm_um or LED_FWHM_UM
     most_w_per_cm2 = min(
         limits.photochemical_w_per_cm2 / limits.photochemical_weight.of_spectrum(*spectrum),

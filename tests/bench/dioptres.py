@@ -20,7 +20,7 @@ from device.values import Calibration, ExposureSettings, Illumination
 from tests.simulated import with_keys
 
 EYES_DPT = (-6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0)
-MOST_RMS_DPT = 0.1
+MAX_RMS_DPT = 0.1
 HEADS: dict[str, tuple[dict[str, float], dict[str, float]]] = {
     "the paper's, dot of 275 um": ({}, {"source_um": 275.0}),
     "z 8 mm, a 0.6, iris 2.6 mm": (
@@ -45,7 +45,7 @@ def factors(drawn: InstrumentSpec, planner: Planner) -> list[tuple[str, float, f
         assert found.geometry is not None
         error = abs(found.geometry.scale_per_dpt / world.geometry.nominal_scale_per_dpt - 1)
         figures.append((f"factor: {name}", error, 0.01))
-    figures.append(("refraction there, dpt RMS", refracted(world.spec, found, planner), MOST_RMS_DPT))
+    figures.append(("refraction there, dpt RMS", refracted(world.spec, found, planner), MAX_RMS_DPT))
     by_drawing = replace(found, geometry=replace(found.geometry, measured_scale_per_dpt=None))
     figures.append(("... and by the drawings, dpt RMS", refracted(world.spec, by_drawing, planner), float("inf")))
     return figures

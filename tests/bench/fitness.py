@@ -8,10 +8,10 @@ import numpy as np
 
 from device.calibration.monitoring.head_check import (
     HOT_HINT_SHARE,
-    LEAST_SCORE,
     MAX_SCORE_SD,
     MAX_SHIFT_DEG,
     MAX_WIDTH_CHANGE,
+    MIN_SCORE,
     ExposurePair,
     assess_capture,
     check,
@@ -77,7 +77,7 @@ def _spread(statements: list[PsfMatchResult], asked: int) -> None:
     wider = np.abs([statement.field_radius_change_ratio for statement in statements])
     print(f"a good head: {asked} frames, {len(statements)} of them say something about the PSF")
     for name, seen, limit, alarms in (
-        ("psf", score, LEAST_SCORE, score < LEAST_SCORE),
+        ("psf", score, MIN_SCORE, score < MIN_SCORE),
         ("shift, deg", off, MAX_SHIFT_DEG, off > MAX_SHIFT_DEG),
         ("width", wider, MAX_WIDTH_CHANGE, wider > MAX_WIDTH_CHANGE),
     ):

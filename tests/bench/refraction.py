@@ -348,7 +348,7 @@ def judge_faults(seed: int, count: int, data: Path) -> bool:
 
 
 CYLINDERS_DPT = (0.0, -1.0, -2.0, -4.0)
-LEAST_GAIN_DB = 0.1  # mean, by a cylinder of -2 dpt
+MIN_GAIN_DB = 0.1  # mean, by a cylinder of -2 dpt
 
 
 def astigmatic_cases(camera: Camera, field_deg: float, seed: int) -> Iterator[Case]:
@@ -406,7 +406,7 @@ def judge_pictures(seed: int, data: Path) -> bool:
             )
             gains_db += [gain for gain, _ in pairs if cylinder_dpt == CYLINDERS_DPT[2]]
     mean_db = float(np.mean(gains_db))
-    holds = mean_db >= LEAST_GAIN_DB
+    holds = mean_db >= MIN_GAIN_DB
     print(f"{'ok  ' if holds else 'MISS'} picture: mean gain {mean_db:+.2f} dB at {CYLINDERS_DPT[2]:g} dpt", flush=True)
     return holds
 
@@ -414,7 +414,7 @@ def judge_pictures(seed: int, data: Path) -> bool:
 BURST = 4  # frames
 DRIFT_DEG, ACCOMMODATION_DPT = 0.15, 0.3  # sd of each frame
 CHI2_OF_ONE_PERCENT = 11.34  # of BURST - 1 degrees of freedom
-MOST_ALARMS = 0.1  # share of the bursts of an eye that does not accommodate
+MAX_ALARMS = 0.1  # share of the bursts of an eye that does not accommodate
 
 
 def burst_of(case: Case, data: Path, accommodation_dpt: float) -> tuple[list[Counts], Plane]:
@@ -432,7 +432,7 @@ def burst_of(case: Case, data: Path, accommodation_dpt: float) -> tuple[list[Cou
 def judge_bursts(seed: int, count: int, data: Path) -> bool:
     """Print errors of M of the first frame and of the burst, and the scatter, of `count` bursts of each sensor.
 
-    Return True if chi^2 is above its 99th percentile in at most MOST_ALARMS of the bursts without accommodation.
+    Return True if chi^2 is above its 99th percentile in at most MAX_ALARMS of the bursts without accommodation.
     """
     alarms: list[bool] = []
     for name in ("imx296-33", "imx296-45", "paper-33"):
@@ -458,7 +458,7 @@ def judge_bursts(seed: int, count: int, data: Path) -> bool:
                     flush=True,
                 )
     share = float(np.mean(alarms))
-    holds = share <= MOST_ALARMS
+    holds = share <= MAX_ALARMS
     print(
         f"{'ok  ' if holds else 'MISS'} bursts: {len(alarms)} of one M, {share:.0%} beyond chi2 (at most 10)",
         flush=True,
@@ -467,7 +467,7 @@ def judge_bursts(seed: int, count: int, data: Path) -> bool:
 
 
 REPEATS = 5
-MOST_CYLINDER_RATIO = 3.0
+MAX_CYLINDER_RATIO = 3.0
 
 
 def processor_s(act: Callable[[], object]) -> float:
@@ -509,12 +509,12 @@ def judge_times(seed: int, data: Path) -> bool:
             continue
         for case in list(cases(group.camera, group.field_deg, 4, seed, 1.0, name="time"))[1::2]:
             pair_s, m_s, cylinder_s, frame_s = times_s(case, planner, data)
-            is_fast = cylinder_s <= MOST_CYLINDER_RATIO * m_s
+            is_fast = cylinder_s <= MAX_CYLINDER_RATIO * m_s
             holds &= is_fast
             print(
                 f"{'ok  ' if is_fast else 'MISS'} {name} {case.photo[-14:]} light {case.light:g}: pair {pair_s:.3f} s, "
                 f"M with edge {m_s:.3f} s ({m_s / pair_s:.1f} pairs), cylinder {cylinder_s:.3f} s "
-                f"({cylinder_s / pair_s:.1f} pairs, {cylinder_s / m_s:.1f} of M; at most {MOST_CYLINDER_RATIO:g}), a "
+                f"({cylinder_s / pair_s:.1f} pairs, {cylinder_s / m_s:.1f} of M; at most {MAX_CYLINDER_RATIO:g}), a "
                 f"frame of a burst {frame_s:.3f} s",
                 flush=True,
             )

@@ -15,7 +15,7 @@ from services.instrument.live_pictures import RETRY_S
 from tests.browser.real import Instruments, Real, Uncalibrated, copy_store
 from tests.browser.upload_queue import queued
 from tests.browser.walk import visit_of
-from tests.journey.asking import MOST_BYTES
+from tests.journey.asking import MAX_BYTES
 from tests.journey.conftest import until
 
 NORMAL_C, CHARGED = 25.0, BatteryState(0.775, 3.88)
@@ -73,7 +73,7 @@ def free_space(size_bytes: int) -> Cause:
     def change(real: Real, value: int) -> None:
         real.free_space.free_bytes = value
 
-    return reading(lambda real: change(real, size_bytes), lambda real: change(real, MOST_BYTES))
+    return reading(lambda real: change(real, size_bytes), lambda real: change(real, MAX_BYTES))
 
 
 def date(days: int) -> Cause:

@@ -10,7 +10,7 @@ from device.values import BatteryState
 from tests.browser.conftest import Complaints
 from tests.browser.real import Real
 from tests.browser.walk import SHUTTER, Open, after_debounce, take_picture, tap, visit_of, wait_for_preview
-from tests.journey.asking import MOST_BYTES
+from tests.journey.asking import MAX_BYTES
 from tests.journey.faults import wait_until_idle
 
 pytestmark = pytest.mark.browser
@@ -100,7 +100,7 @@ def test_full_storage_during_visit_keeps_captures(open_page: Open, real: Real) -
     )
     expect_ended(page, "store.full")
     expect_chip(page, "store.low", r"Space for \d+ more")
-    real.free_space.free_bytes = MOST_BYTES
+    real.free_space.free_bytes = MAX_BYTES
     expect_ended(page, "store.low")
     take_picture(page)
     assert len(real.rig.store.captures()) == len(kept) + 1

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 RECORDS = Path(__file__).parent / "records"
-MOST_LINES = 60  # maximum length of a printed difference
+MAX_LINES = 60  # maximum length of a printed difference
 
 
 def as_text(record: Any) -> str:
@@ -26,15 +26,15 @@ def read(name: str) -> Any:
 
 
 def difference(recorded: Any, present: Any, tolerance: float = 0.0) -> str:
-    """Return a unified diff of two records, at most MOST_LINES long; empty for equal records.
+    """Return a unified diff of two records, at most MAX_LINES long; empty for equal records.
 
     Floating-point figures are equal if they differ by at most `tolerance` times the recorded one, or times 1.
     """
     present = _without_rounding(recorded, json.loads(json.dumps(present)), tolerance)
     texts = [as_text(one).splitlines() for one in (recorded, present)]
     lines = list(difflib.unified_diff(*texts, "recorded", "present", lineterm="", n=2))
-    more = [f"... and {len(lines) - MOST_LINES} lines more"] if len(lines) > MOST_LINES else []
-    return "\n".join(lines[:MOST_LINES] + more)
+    more = [f"... and {len(lines) - MAX_LINES} lines more"] if len(lines) > MAX_LINES else []
+    return "\n".join(lines[:MAX_LINES] + more)
 
 
 def _without_rounding(recorded: Any, present: Any, tolerance: float) -> Any:

@@ -23,7 +23,7 @@ WORD = re.compile(r'"((?:\\x..)*)"')
 OPENED = re.compile(r"\d+<((?:\\x..)*)>")
 OPEN = re.compile(r"^(?:AT_FDCWD|\d+)<((?:\\x..)*)>")
 DRAWS = 3
-MOST_ALONE = 8  # the last changes, each of which is once the only survivor
+MAX_ALONE = 8  # the last changes, each of which is once the only survivor
 SECTOR_BYTES = 512
 
 
@@ -269,7 +269,7 @@ class Disk:
                     return "write", at, data[: SECTOR_BYTES * draw.randint(0, len(data) // SECTOR_BYTES)]
             return change
 
-        alone = [partial(_alone, one) for one in waiting[-MOST_ALONE:]]
+        alone = [partial(_alone, one) for one in waiting[-MAX_ALONE:]]
         for way in (*ways, *alone, *[some] * draws):
             left: dict[str, bytes | None] = {}
             _collect(self._root, "", _together(way, waiting), left)

@@ -16,7 +16,7 @@ from device.clock import SystemClock, VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
-from device.recon.assessment.exposure_split import LEAST_GAIN_DB, PressLight, choose_split
+from device.recon.assessment.exposure_split import MIN_GAIN_DB, PressLight, choose_split
 from device.recon.burst import BurstJoiner, JoinedFrame
 from device.recon.colour import join_colours
 from device.recon.estimation.registration import Shift
@@ -176,9 +176,7 @@ def test_a_split_press_of_a_moving_simulated_eye_is_nearer_to_the_truth(tmp_path
     assert [one.parts for one in splits] == [1, 2]
     assert doses[1] == pytest.approx(doses[0])
     gain_db = corrected_db[1] - corrected_db[0]
-    assert gain_db == pytest.approx(splits[1].gain_db, abs=3 * LEAST_GAIN_DB), (
-        "three times the largest error of the fit"
-    )
+    assert gain_db == pytest.approx(splits[1].gain_db, abs=3 * MIN_GAIN_DB), "three times the largest error of the fit"
     assert gain_db > 0.3
 
 

@@ -23,7 +23,7 @@ from tests.receiver import Receiver
 
 BUS = BusSpec(backend="sim", thermometer=0x48, battery=0x36)
 MAKE_WEEKS = 10  # age of the calibration
-MOST_BYTES = 10**12
+MAX_BYTES = 10**12
 
 
 def live_picture(exam: ExamService, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
@@ -35,7 +35,7 @@ def live_picture(exam: ExamService, after: int, wait_s: float = 2.0, wanted: Liv
 class DiskStub:
     """Stub of the disk (free bytes, delay hook `on_query`) and the receiver of finished visits."""
 
-    free_bytes: int = MOST_BYTES
+    free_bytes: int = MAX_BYTES
     on_query: Callable[[], None] = lambda: None
     receiver: Receiver = field(default_factory=Receiver)
 

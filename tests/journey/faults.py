@@ -19,7 +19,7 @@ from device.values import BatteryState
 from services.delivery.upload_worker import UploadWorker
 from tests.journey.asking import (
     MAKE_WEEKS,
-    MOST_BYTES,
+    MAX_BYTES,
     DiskStub,
     Observation,
     PressHookBus,
@@ -152,7 +152,7 @@ def store_full(rig: Rig, disk: DiskStub) -> Observation:
     refused = post_capture(rig)
     assert (refused.way, refused.code) == ("507", "store.full")
     assert rig.request("GET", "/api/captures").json() == stored, "no stored capture is lost"
-    disk.free_bytes = MOST_BYTES
+    disk.free_bytes = MAX_BYTES
     rig.application.alerts.publish_changes()
     assert rig.published_events()[-1] == ("notice", {"code": "store.full", "over": True})
     assert post_capture(rig).way == "verdict", "captures work again with free space"

@@ -76,7 +76,7 @@ def rig(equipped: tuple[Rig, DiskStub]) -> Iterator[Rig]:
     rig.application.alerts.publish_changes()
     yield rig
     faults.repair(rig)
-    disk.free_bytes, disk.on_query, rig.clock.start = asking.MOST_BYTES, lambda: None, began
+    disk.free_bytes, disk.on_query, rig.clock.start = asking.MAX_BYTES, lambda: None, began
     rig.application.alerts.publish_changes()
 
 

@@ -19,7 +19,7 @@ from device.clock import VirtualClock
 from services.errors import UpdateDuringExam
 from services.http.app import create_app
 from services.http.routes.updates import update_routes
-from services.instrument.update_requests import MOST_BYTES, PICKUP_TIMEOUT_S, UpdateRequests, release_notes
+from services.instrument.update_requests import MAX_BYTES, PICKUP_TIMEOUT_S, UpdateRequests, release_notes
 from services.update import preconditions
 from services.update.ipc import REQUEST_FILE, TABLET, UPLOAD, UpdateRequest, write_request
 from services.update.updater import Updater
@@ -228,7 +228,7 @@ def test_uploaded_update_is_found_and_installed(page: Page) -> None:
 
 def test_incomplete_or_oversized_upload_is_refused_and_leaves_no_file(page: Page) -> None:
     folder = page.board.state / TABLET
-    for length, code in ((0, "input"), (MOST_BYTES + 1, "input"), (10**15, "input")):
+    for length, code in ((0, "input"), (MAX_BYTES + 1, "input"), (10**15, "input")):
         answer = page.ask("PUT", "/file", content=b"", headers={"Content-Length": str(length)})
         assert (answer.status_code, answer.json()["code"]) == (422, code)
 
@@ -243,7 +243,7 @@ def test_incomplete_or_oversized_upload_is_refused_and_leaves_no_file(page: Page
 
 
 def test_full_disk_and_a_concurrent_upload_are_refused(page: Page) -> None:
-    too_large = page.ask("PUT", "/file", content=b"", headers={"Content-Length": str(MOST_BYTES)})
+    too_large = page.ask("PUT", "/file", content=b"", headers={"Content-Length": str(MAX_BYTES)})
     if too_large.status_code != 422:  # on a computer with a small disk
         assert too_large.json()["code"] == "update.room"
 

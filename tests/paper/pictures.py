@@ -14,7 +14,7 @@ from tests.paper.bench import SimulatedFrame
 from tests.paper.outcome import Figure
 
 DARKEST, BRIGHTEST = 0.5, 99.7  # percentiles of the field shown as black and white
-LEAST_SIDE_PX = 420
+MIN_SIDE_PX = 420
 MARGIN_PX = 6
 TILE_PX = 480
 
@@ -131,8 +131,8 @@ def _svg(caption: str, plot: Plot) -> Figure:
 
 
 def _enlarged(grey: Pixels) -> Pixels:
-    """Return a small picture with each pixel repeated, so that its shorter side has at least LEAST_SIDE_PX."""
-    enlarge = max(1, LEAST_SIDE_PX // max(min(grey.shape), 1))
+    """Return a small picture with each pixel repeated, so that its shorter side has at least MIN_SIDE_PX."""
+    enlarge = max(1, MIN_SIDE_PX // max(min(grey.shape), 1))
     return grey.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
 
 

@@ -5,16 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from device.recon.assessment.exposure_split import (
-    LEAST_GAIN_DB,
-    LEAST_MOTION_DEG,
-    MOST_FRAMES,
+    MAX_FRAMES,
+    MIN_GAIN_DB,
+    MIN_MOTION_DEG,
     WHOLE,
     PressLight,
     choose_split,
     dark_fits,
     loss_db,
 )
-from device.recon.assessment.frame_quality import LEAST_E_PER_UM2
+from device.recon.assessment.frame_quality import MIN_E_PER_UM2
 
 DEG_PER_PX = 1 / 15.583  # of the paper's sensor
 E_PER_UM2 = 0.28 * 1000 / 5.04**2  # mean light of frames whose brightest pixel of 5.04 um holds 1,000 electrons
@@ -54,11 +54,11 @@ def test_a_split_adds_no_light_and_is_made_for_a_gain(
         return
     motion_deg, light_e_per_um2 = speed_deg_per_s * exposure_s, light_e_per_um2_s * exposure_s
     assert split.parts >= 2
-    assert split.parts * count <= MOST_FRAMES
+    assert split.parts * count <= MAX_FRAMES
     assert split.motion_deg == pytest.approx(motion_deg)
-    assert split.motion_deg > LEAST_MOTION_DEG
+    assert split.motion_deg > MIN_MOTION_DEG
     assert split.part_s is not None
-    assert light_e_per_um2_s * split.part_s > LEAST_E_PER_UM2, "a part would be judged as too dark"
+    assert light_e_per_um2_s * split.part_s > MIN_E_PER_UM2, "a part would be judged as too dark"
     assert split.parts * (split.part_s + overhead_s) == pytest.approx(exposure_s + overhead_s), (
         "the lamp is on for longer"
     )
@@ -66,12 +66,12 @@ def test_a_split_adds_no_light_and_is_made_for_a_gain(
         loss_db(frames, count * motion_deg, count * light_e_per_um2) for frames in (count, count * split.parts)
     )
     assert split.gain_db <= whole_db - parts_db + 1e-9, "shorter light is no gain"  # rounding
-    assert split.gain_db >= LEAST_GAIN_DB
+    assert split.gain_db >= MIN_GAIN_DB
 
 
 @given(counts, exposures_s, lights_e_per_um2_s)
 def test_an_eye_that_stands_still_or_is_not_seen_has_whole_exposures(count, exposure_s, light_e_per_um2_s) -> None:
-    for speed_deg_per_s in (None, 0.0, LEAST_MOTION_DEG / exposure_s * 0.999):
+    for speed_deg_per_s in (None, 0.0, MIN_MOTION_DEG / exposure_s * 0.999):
         assert choose_split(count, exposure_s, speed_deg_per_s, PressLight(light_e_per_um2_s, 0.0)) == WHOLE
     assert choose_split(count, exposure_s, 10.0, None) == WHOLE, "the light is not known"
 

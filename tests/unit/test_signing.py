@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import (
 from device.calibration import archive as archive_module
 from device.calibration.archive import Archive
 from device.calibration.signing import (
-    MOST_BYTES,
+    MAX_BYTES,
     Signer,
     create_key_pair,
     export,
@@ -140,7 +140,7 @@ def test_another_calibration_format_is_distinguished_from_damage(archive):
 def test_an_oversized_file_is_refused_before_reading(trusted_signer, tmp_path):
     oversized = tmp_path / "vast"
     with oversized.open("wb") as file:
-        file.truncate(MOST_BYTES + 1)  # a sparse file
+        file.truncate(MAX_BYTES + 1)  # a sparse file
     with pytest.raises(CalibrationDamaged, match="larger"):
         read_export(oversized, (trusted_signer,))
 

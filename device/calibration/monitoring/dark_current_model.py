@@ -16,7 +16,7 @@ from device.values import Image
 
 REFERENCE_C = 25.0
 MIN_TEMPERATURE_RANGE_C = 3.0
-LEAST_E_PER_S = 0.5  # three times the apparent dark current of a sensor without any
+MIN_E_PER_S = 0.5  # three times the apparent dark current of a sensor without any
 MIN_DOUBLING_C, MAX_DOUBLING_C = 4.0, 12.0  # per doubling; outside, the cause is not temperature
 
 
@@ -53,8 +53,8 @@ class DarkCurrentModel:
 
 
 def fit_dark_current(darks: Iterable[DarkStep]) -> DarkCurrentModel | None:
-    """Return the model of these steps; None with fewer than two above LEAST_E_PER_S, or a range below 3 C."""
-    known = [dark for dark in darks if isfinite(dark.temperature_c) and dark.e_per_s > LEAST_E_PER_S]
+    """Return the model of these steps; None with fewer than two above MIN_E_PER_S, or a range below 3 C."""
+    known = [dark for dark in darks if isfinite(dark.temperature_c) and dark.e_per_s > MIN_E_PER_S]
     if len(known) < 2 or np.ptp([dark.temperature_c for dark in known]) < MIN_TEMPERATURE_RANGE_C:
         return None
     warmer_c = np.array([dark.temperature_c - REFERENCE_C for dark in known])
@@ -78,7 +78,9 @@ def dark_steps(archive: Archive, serial: str) -> Sequence[DarkStep]:
 
 def dark_dn_at(kept: StoredCalibration, temperature_c: float) -> Image | None:
     """Return the dark frame at another temperature, (rows, cols), DN; None without a model, a dark frame or a gain."""
-    figures, sensor, dark_dn = dict(kept.provenance.figures), kept.calibration.sensor, kept.calibration.dark_dn
+    figures = dict(kept.provenance.figures)
+    sensor = kept.calibration.sensor
+    dark_dn = kept.calibration.dark_dn
     if "dark_doubling_c" not in figures or dark_dn is None or sensor.gain_e_per_dn is None:
         return None
     model = DarkCurrentModel(figures["dark_25c_e_per_s"], figures["dark_doubling_c"], int(figures["dark_law_steps"]))

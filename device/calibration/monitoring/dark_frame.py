@@ -40,7 +40,8 @@ def assess_dark_frame(
 ) -> DarkFrameAssessment:
     """Return the assessment of a dark frame (rows, cols) of `exposure_s`; `between` is called between its steps."""
     figures = dict(provenance.figures) if provenance is not None else {}
-    gain, black_dn = calibration.sensor.gain_e_per_dn, calibration.sensor.black_dn
+    gain = calibration.sensor.gain_e_per_dn
+    black_dn = calibration.sensor.black_dn
     warmth_dn = figures.get("dark_e_per_s", 0.0) * exposure_s / gain if gain else 0.0
     level_dn = calibration.dark_dn if calibration.dark_dn is not None else np.float32(black_dn + warmth_dn)
     off: Image = counts.astype(np.float32) - level_dn
@@ -65,7 +66,8 @@ def assess_dark_frame(
 
 def _sigma_dn(calibration: Calibration, figures: dict[str, float], warmth_dn: float) -> float | None:
     """Return the expected noise, DN: read noise, dark-current noise, and DSNU without a map; None if any is unknown."""
-    gain, read_e = calibration.sensor.gain_e_per_dn, calibration.sensor.read_noise_e
+    gain = calibration.sensor.gain_e_per_dn
+    read_e = calibration.sensor.read_noise_e
     if gain is None or read_e is None or "pattern_e" not in figures:
         return None
     pattern_e = figures["pattern_e"] if calibration.dark_dn is None else 0.0

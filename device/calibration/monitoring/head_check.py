@@ -29,13 +29,11 @@ RECENT_CAPTURES = 3  # number of recent captures that decide
 MIN_FAILED_CAPTURES = 2  # number of them that must fail before pictures are refused
 
 MAX_SCORE_SD = 0.15  # a frame with a larger score sd is too dark or empty, and is not used for the PSF
-LEAST_SCORE = 0.6
+MIN_SCORE = 0.6
 MAX_SHIFT_DEG = 0.5
 MAX_WIDTH_CHANGE = 0.009
-HOT_HINT_SHARE, MOST_HOT = (
-    1e-4,
-    1e-3,
-)  # share of pixels; unmarked, they cost 0.05 and 0.35 of correlation (NUMERICS.md 6.1)
+HOT_HINT_SHARE = 1e-4  # share of pixels; unmarked, they cost 0.05 and 0.35 of correlation (NUMERICS.md 6.1)
+MAX_HOT = 1e-3
 BLACK_DN = 1.5  # in addition to one doubling of the dark current
 MAX_NOISE_RATIO = 1.5  # ratio to the calibration
 
@@ -113,7 +111,7 @@ def check(
     """Return the findings on age, PSF, field, refraction and darks for which the data suffice; input in any order."""
     recent = sorted(assessments, key=lambda one: one.taken_at)
     statements = [one.statement for one in recent if one.statement is not None and one.statement.sd <= MAX_SCORE_SD]
-    fitting = [one for one in statements if one.upper_limit >= LEAST_SCORE][-RECENT_CAPTURES:]
+    fitting = [one for one in statements if one.upper_limit >= MIN_SCORE][-RECENT_CAPTURES:]
     found = [check_age(provenance, now)] if provenance is not None else []
     if statements:
         found.append(_psf_finding(statements[-RECENT_CAPTURES:]))
@@ -143,13 +141,13 @@ def raise_on_failure(findings: Sequence[Finding]) -> None:
 
 def _psf_finding(statements: Sequence[PsfMatchResult]) -> Finding:
     """Return the PSF finding of the last captures: failed if two do not match, a hint if only the newest does not."""
-    doubts = sum(one.upper_limit < LEAST_SCORE for one in statements)
+    doubts = sum(one.upper_limit < MIN_SCORE for one in statements)
     value = median(one.upper_limit for one in statements)
     if doubts >= MIN_FAILED_CAPTURES:
-        return Finding("psf", False, value, LEAST_SCORE, "of 1", CALIBRATE_REMEDY)
-    if statements[-1].upper_limit < LEAST_SCORE:
-        return Finding("psf", False, statements[-1].upper_limit, LEAST_SCORE, "of 1", REPEAT_REMEDY, hint=True)
-    return Finding("psf", True, value, LEAST_SCORE, "of 1")
+        return Finding("psf", False, value, MIN_SCORE, "of 1", CALIBRATE_REMEDY)
+    if statements[-1].upper_limit < MIN_SCORE:
+        return Finding("psf", False, statements[-1].upper_limit, MIN_SCORE, "of 1", REPEAT_REMEDY, hint=True)
+    return Finding("psf", True, value, MIN_SCORE, "of 1")
 
 
 def _field_findings(statements: Sequence[PsfMatchResult]) -> list[Finding]:
@@ -249,9 +247,9 @@ def _dark_findings(calibration: Calibration, darks: Sequence[DarkFrameAssessment
 
 
 def _hot_pixel_finding(share: float) -> Finding:
-    """Return the finding on the share of hot pixels: a failure above MOST_HOT, a hint above HOT_HINT_SHARE."""
-    if share > MOST_HOT:
-        return Finding("hot pixels", False, 100 * share, 100 * MOST_HOT, "%", CALIBRATE_REMEDY)
+    """Return the finding on the share of hot pixels: a failure above MAX_HOT, a hint above HOT_HINT_SHARE."""
+    if share > MAX_HOT:
+        return Finding("hot pixels", False, 100 * share, 100 * MAX_HOT, "%", CALIBRATE_REMEDY)
     return _hint(
         "hot pixels", 100 * share, 100 * HOT_HINT_SHARE, "%", "More pixels shine in the dark. Plan a calibration."
     )

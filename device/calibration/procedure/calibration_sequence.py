@@ -25,7 +25,7 @@ from device.calibration.procedure.dioptres import (
     similarity_of_points,
 )
 from device.calibration.procedure.finished_steps import Step, StepCheckpoints
-from device.calibration.procedure.flats import LEAST_SHARE, Flats, measure_flats
+from device.calibration.procedure.flats import MIN_SHARE, Flats, measure_flats
 from device.calibration.procedure.moments import Moments
 from device.calibration.procedure.point_source import MotionCheck, PointSource, measure_point_source, refuse_level
 from device.calibration.procedure.raw_recorder import RawRecorder
@@ -197,7 +197,8 @@ class CalibrationSequence:
 
     def _measure_dioptres(self, darks: Darks, flats: Flats, point: PointSource, geometry: Geometry) -> DioptreScale:
         """Return the scale per dioptre, fitted to all axial positions; if the fit fails, discard their checkpoints."""
-        pitch_um, eye_mm = self.job.spec.camera.pitch_um, self.job.eye_mm
+        pitch_um = self.job.spec.camera.pitch_um
+        eye_mm = self.job.eye_mm
         seen: dict[float, PsfSimilarity] = {}
         for stand, moved_mm in AXIAL_OFFSETS_MM.items():
 
@@ -216,7 +217,8 @@ class CalibrationSequence:
         except CalibrationRefused:
             self.checkpoints.discard(*(stand.replace(" ", "") for stand in AXIAL_OFFSETS_MM))
             raise
-        factor, nominal = found.scale_per_dpt, geometry.nominal_scale_per_dpt
+        factor = found.scale_per_dpt
+        nominal = geometry.nominal_scale_per_dpt
         self.operator.show_message(
             f"dioptres: {factor:.3%} of stretch each, {factor / nominal - 1:+.1%} beside the drawings"
         )
@@ -243,7 +245,9 @@ class CalibrationSequence:
 
     def _colour_psfs(self, darks: Darks, flats: Flats, point: PointSource) -> tuple[tuple[Psf, ...], dict[str, float]]:
         """Return the PSF, one more per colour that differs, and each colour's correlation and scale to the first."""
-        job, own, figures = self.job, dict[Colour, Psf](), dict[str, float]()
+        job = self.job
+        own = dict[Colour, Psf]()
+        figures = dict[str, float]()
         for colour in job.other_colours:
 
             def measure(colour: Colour = colour) -> PointSource:
@@ -273,7 +277,7 @@ class CalibrationSequence:
         return darks if self.thermometer is None else replace(darks, warm_c=self.thermometer.read_c())
 
     def _measure_flats(self, darks: Darks) -> Flats:
-        full_s = self._exposures.exposure_for(TARGET_FILL_SHARE, darks, 50.0, 3.0, LEAST_SHARE)
+        full_s = self._exposures.exposure_for(TARGET_FILL_SHARE, darks, 50.0, 3.0, MIN_SHARE)
         levels = [self._exposures.moments(share * full_s, FLAT_FRAMES) for share in FLAT_LEVELS]
         return measure_flats(levels, self._exposures.moments(SATURATING_FACTOR * full_s, 2), darks)
 
@@ -303,7 +307,9 @@ class CalibrationSequence:
     def _build_calibration(
         self, darks: Darks, flats: Flats, psfs: tuple[Psf, ...], dioptres: DioptreScale | None
     ) -> Calibration:
-        spec, geometry, gain = self.job.spec, self.job.geometry, flats.gain_e_per_dn
+        spec = self.job.spec
+        geometry = self.job.geometry
+        gain = flats.gain_e_per_dn
         if geometry is not None and dioptres is not None:
             geometry = replace(geometry, measured_scale_per_dpt=dioptres.scale_per_dpt)
         sensor = Sensor(darks.black_dn, gain, _read_noise_e(darks, gain), flats.white_dn, flats.bend_per_dn)
@@ -320,7 +326,8 @@ class CalibrationSequence:
 
     def _build_provenance(self, figures: dict[str, float]) -> Provenance:
         temperature_c = self.thermometer.read_c() if self.thermometer is not None else None
-        job, leds = self.job, self.job.leds
+        job = self.job
+        leds = self.job.leds
         if leds is not None:
             figures = figures | leds.figures
         identity = job.serial, self.clock.wall(), job.made_by, job.software

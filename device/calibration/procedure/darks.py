@@ -18,9 +18,9 @@ from device.errors import CalibrationRefused
 from device.values import Image, Mask
 
 HOT_SIGMAS = 6.0  # of pattern and noise: a normal pixel exceeds them once in 5e8
-MOST_HOT = 0.02  # share of pixels; a larger share is light, not dark current
-MOST_DARK_SHARE = 0.05  # of the converter: a dark frame that rises by more than this saw light
-MOST_SHADING_DN = 0.5  # between parts of a dark frame, beside 6 sigma of its noise
+MAX_HOT = 0.02  # share of pixels; a larger share is light, not dark current
+MAX_DARK_SHARE = 0.05  # of the converter: a dark frame that rises by more than this saw light
+MAX_SHADING_DN = 0.5  # between parts of a dark frame, beside 6 sigma of its noise
 MIN_THIRD_COUNTS = 10.0  # occurrences of a third count; fewer carry no information on sigma
 MIN_SIGMA_DN = 0.05  # with less noise than this only one count occurs
 DARKEN_REMEDY = "Put the cap on, turn the lamp off, shade the room, then start again."
@@ -77,7 +77,8 @@ def measure_darks(exposures: Sequence[Moments], map_s: float, white_dn: float) -
     level_dn = black_dn + dark_dn_per_s * mapped.exposure_s  # of the fit: rounding biases the mean of counts
     mean_dn += np.float32(level_dn - float(mean_dn[~hot].mean(dtype=np.float64)))
     pattern_dn = sqrt(max(total_dn**2 - read_dn**2, 0.0))
-    rate_dn_per_s, shortest_s = float(dark_dn_per_s), shortest.exposure_s
+    rate_dn_per_s = float(dark_dn_per_s)
+    shortest_s = shortest.exposure_s
     return Darks(float(black_dn), shortest_s, read_dn, pattern_dn, rate_dn_per_s, mapped.exposure_s, mean_dn, hot)
 
 
@@ -188,17 +189,17 @@ def _refuse_light(exposures: Sequence[Moments], hot: Mask, rise_dn: float, white
     """Raise CalibrationRefused for too many hot pixels, too large a rise with the exposure, or a brighter part."""
     longest = max(exposures, key=lambda one: one.exposure_s)
     remedy = DARKEN_REMEDY
-    if hot.mean() > MOST_HOT:
-        raise CalibrationRefused(f"{hot.mean():.1%} of the pixels shine in the dark (at most {MOST_HOT:.0%})", remedy)
-    if rise_dn > MOST_DARK_SHARE * white_dn:
+    if hot.mean() > MAX_HOT:
+        raise CalibrationRefused(f"{hot.mean():.1%} of the pixels shine in the dark (at most {MAX_HOT:.0%})", remedy)
+    if rise_dn > MAX_DARK_SHARE * white_dn:
         message = (
-            f"the dark frames rise by {rise_dn:.0f} DN with the exposure (at most {MOST_DARK_SHARE * white_dn:.0f})"
+            f"the dark frames rise by {rise_dn:.0f} DN with the exposure (at most {MAX_DARK_SHARE * white_dn:.0f})"
         )
         raise CalibrationRefused(message, remedy)
     mean = np.where(hot, np.float32(np.median(longest.mean_dn)), longest.mean_dn)
     parts = np.array([[part.mean() for part in np.array_split(row, 8, 1)] for row in np.array_split(mean, 8, 0)])
     shading_dn = float(np.ptp(parts))
-    allowed_dn = MOST_SHADING_DN + 12 * float(mean.std()) * 8 / sqrt(mean.size)
+    allowed_dn = MAX_SHADING_DN + 12 * float(mean.std()) * 8 / sqrt(mean.size)
     if shading_dn > allowed_dn:
         message = f"one part of the dark frames is {shading_dn:.2f} DN brighter than another (at most {allowed_dn:.2f})"
         raise CalibrationRefused(message, remedy)

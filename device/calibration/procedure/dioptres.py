@@ -20,11 +20,11 @@ from device.values import Geometry, Psf
 
 SAMPLE_UM = 10.0  # the caustic is band-limited to two of these (OPTICS.md 2.4)
 RADIUS_FACTOR = 1.12  # times the PSF radius: contains the scaled PSF too
-MOST_STRETCH, SCALE_STEPS = 0.08, 41  # of the coarse search; one step moves the iris edge by less than one grain
-LEAST_LIKENESS = 0.9
-MOST_SIDEWAYS_DEG = 0.25
-LEAST_SHARE, MOST_SHARE = 0.5, 1.6  # of the nominal stretch of the drawings
-MOST_OFF_DPT = 0.2  # residual of one position: 0.12 mm of the rail
+MAX_STRETCH, SCALE_STEPS = 0.08, 41  # of the coarse search; one step moves the iris edge by less than one grain
+MIN_LIKENESS = 0.9
+MAX_SIDEWAYS_DEG = 0.25
+MIN_SHARE, MAX_SHARE = 0.5, 1.6  # of the nominal stretch of the drawings
+MAX_OFF_DPT = 0.2  # residual of one position: 0.12 mm of the rail
 REMEDY = "Move the source along the axis only, to the places that are asked for, away from the lens where it says +."
 
 Floats = NDArray[np.float64]
@@ -88,18 +88,18 @@ def similarity_of_points(first: PointSource, second: PointSource, pitch_um: floa
 
 def refuse_wrong_position(found: PsfSimilarity, moved_mm: float, eye_mm: float, geometry: Geometry) -> None:
     """Raise CalibrationRefused if the source did not move by about `moved_mm` along the axis, or is another source."""
-    if found.correlation < LEAST_LIKENESS:
+    if found.correlation < MIN_LIKENESS:
         message = (
             f"at {moved_mm:+g} mm the PSF is not the stored one, only stretched: correlation {found.correlation:.2f}"
         )
-        raise CalibrationRefused(f"{message} (at least {LEAST_LIKENESS})", REMEDY)
+        raise CalibrationRefused(f"{message} (at least {MIN_LIKENESS})", REMEDY)
     sideways_deg = hypot(*found.moved_px) / geometry.px_per_deg
-    if sideways_deg > MOST_SIDEWAYS_DEG:
+    if sideways_deg > MAX_SIDEWAYS_DEG:
         message = f"at {moved_mm:+g} mm the source has moved sideways by {sideways_deg:.2f} degrees"
-        raise CalibrationRefused(f"{message} (at most {MOST_SIDEWAYS_DEG})", REMEDY)
+        raise CalibrationRefused(f"{message} (at most {MAX_SIDEWAYS_DEG})", REMEDY)
     share = (1 - found.scale) / (geometry.nominal_scale_per_dpt * sphere_dpt(moved_mm, eye_mm))
-    if not LEAST_SHARE < share < MOST_SHARE:
-        how = "the other way" if share < -LEAST_SHARE / 2 else "too little" if share < LEAST_SHARE else "too far"
+    if not MIN_SHARE < share < MAX_SHARE:
+        how = "the other way" if share < -MIN_SHARE / 2 else "too little" if share < MIN_SHARE else "too far"
         message = f"at {moved_mm:+g} mm the source has moved {how}: the PSF is stretched by {found.scale - 1:+.2%}"
         wanted = -geometry.nominal_scale_per_dpt * sphere_dpt(moved_mm, eye_mm)
         raise CalibrationRefused(f"{message} where about {wanted:+.2%} are due", REMEDY)
@@ -119,10 +119,10 @@ def fit_dioptre_scale(scales: Mapping[float, float], eye_mm: float) -> DioptreSc
     factor = float(spheres_dpt @ shrunk) / squares
     off_dpt = (shrunk - factor * spheres_dpt) / factor
     worst = int(np.argmax(np.abs(off_dpt)))
-    if abs(off_dpt[worst]) > MOST_OFF_DPT:
+    if abs(off_dpt[worst]) > MAX_OFF_DPT:
         raise CalibrationRefused(
             f"at {list(scales)[worst]:+g} mm the PSF is {off_dpt[worst]:+.2f} dpt beside the line of all places "
-            f"(at most {MOST_OFF_DPT})",
+            f"(at most {MAX_OFF_DPT})",
             REMEDY,
         )
     sd = abs(factor) * sqrt(float(off_dpt @ off_dpt) / (len(scales) - 1) / squares)
@@ -159,7 +159,7 @@ def _coarse_search(splines: Floats, seen: Floats) -> tuple[float, float, float]:
     """Return the scale with the best correlation at any shift, and that shift in samples: scale, rows, cols."""
     spectrum = fft.rfft2(seen - seen.mean())
     best = (-np.inf, 1.0, 0.0, 0.0)
-    for scale in np.linspace(1 - MOST_STRETCH, 1 + MOST_STRETCH, SCALE_STEPS):
+    for scale in np.linspace(1 - MAX_STRETCH, 1 + MAX_STRETCH, SCALE_STEPS):
         tried = _warped(splines, float(scale), (0.0, 0.0))
         tried -= tried.mean()
         alike = fft.irfft2(spectrum * np.conj(fft.rfft2(tried)), seen.shape) / sqrt(_dot(tried, tried))

@@ -14,10 +14,10 @@ from device.values import Image, Mask
 
 BLOCKS = 24  # per side, to which the shading is fitted
 ORDER = 4  # of the polynomial that models the shading of a screen
-MOST_SHADING = 0.4  # from the darkest to the brightest part of a screen; decision 0018 has what to expect
-MOST_UNEVEN = 0.01  # residual of a block, in addition to 6 sigma of the pixels
-LEAST_SHARE = 0.02  # of the converter range: a darker flat means that the cap is on
-MOST_BEND = 0.1  # at white
+MAX_SHADING = 0.4  # from the darkest to the brightest part of a screen; decision 0018 has what to expect
+MAX_UNEVEN = 0.01  # residual of a block, in addition to 6 sigma of the pixels
+MIN_SHARE = 0.02  # of the converter range: a darker flat means that the cap is on
+MAX_BEND = 0.1  # at white
 DEAD_PIXEL_RESPONSE = 0.5  # share of the mean response
 MIN_SATURATED_PIXELS = 0.2  # share of pixels at the same count: half of a mosaic may be dark in one colour
 SATURATED_SHARE = 0.95  # of the converter range; brighter pixels are clipped
@@ -67,9 +67,9 @@ def measure_flats(levels: Sequence[Moments], bright: Moments, darks: Darks) -> F
     variances = np.array([float(one.variance_dn2[good].mean(dtype=np.float64)) for one in levels])
     gain = photon_transfer(per_s * times_s, variances, bend_per_dn, darks)
     bend = bend_per_dn * (white_dn - darks.black_dn)
-    if abs(bend) > MOST_BEND:
+    if abs(bend) > MAX_BEND:
         raise CalibrationRefused(
-            f"the counts do not grow with the exposure: they bend by {bend:+.1%} at white (at most {MOST_BEND:.0%})",
+            f"the counts do not grow with the exposure: they bend by {bend:+.1%} at white (at most {MAX_BEND:.0%})",
             "Use a screen that does not flicker, and switch off the camera's own tone curve.",
         )
     return Flats(gain, white_dn, bend, bend_per_dn, shading, response, dead)
@@ -116,16 +116,17 @@ def flat_field_response(light: Image, good: Mask) -> tuple[Image, float]:
     solved = np.linalg.lstsq(basis * weight[:, None], blocks.ravel() * weight, rcond=None)
     found = np.asarray(solved[0], np.float64)
     smooth = (basis @ found).reshape(blocks.shape)
-    darkest, brightest = float(blocks.min()), float(blocks.max())
+    darkest = float(blocks.min())
+    brightest = float(blocks.max())
     remedy = "Lay the camera, without iris and diffuser, on the clean screen, light it evenly, then start again."
-    if darkest < (1 - MOST_SHADING) * brightest:
+    if darkest < (1 - MAX_SHADING) * brightest:
         fall = 1 - darkest / brightest
-        message = f"one part of the flat is {fall:.0%} darker than another (at most {MOST_SHADING:.0%})"
+        message = f"one part of the flat is {fall:.0%} darker than another (at most {MAX_SHADING:.0%})"
         raise CalibrationRefused(message, remedy)
     uneven = np.abs(blocks / smooth - 1)
     size = np.sqrt(light.size / blocks.size)
     pixels = float(np.std(light[good] / light[good].mean(dtype=np.float64), dtype=np.float64))
-    allowed = MOST_UNEVEN + 6 * pixels / size
+    allowed = MAX_UNEVEN + 6 * pixels / size
     if uneven.max() > allowed:
         message = f"one part of the flat differs by {uneven.max():.1%} from its surroundings (at most {allowed:.1%})"
         raise CalibrationRefused(message, remedy)
@@ -196,10 +197,11 @@ def _saturation_dn(bright: Moments, longest: Moments, good: Mask) -> float:
 
 def _refuse_level(one: Moments, signal: Image, good: Mask, white_dn: float) -> None:
     """Raise CalibrationRefused if a flat is too dark or saturated."""
-    mean_dn, highest_dn = float(np.median(signal[good])), float(np.percentile(one.highest[good], 99))
-    if mean_dn < LEAST_SHARE * white_dn:
+    mean_dn = float(np.median(signal[good]))
+    highest_dn = float(np.percentile(one.highest[good], 99))
+    if mean_dn < MIN_SHARE * white_dn:
         raise CalibrationRefused(
-            f"the flat of {one.exposure_s:.3g} s is dark: {mean_dn:.0f} DN (at least {LEAST_SHARE * white_dn:.0f})",
+            f"the flat of {one.exposure_s:.3g} s is dark: {mean_dn:.0f} DN (at least {MIN_SHARE * white_dn:.0f})",
             "Take the cap off and switch the screen on, then start again.",
         )
     if highest_dn >= SATURATED_SHARE * white_dn:

@@ -15,7 +15,9 @@ class Moments:
     """
 
     def __init__(self, shape: tuple[int, int], exposure_s: float) -> None:
-        self.shape, self.exposure_s, self.count = shape, exposure_s, 0
+        self.shape = shape
+        self.exposure_s = exposure_s
+        self.count = 0
         self._sum = np.zeros(shape, np.int64)
         self._squares = np.zeros(shape, np.int64)
         self._wide = np.empty(shape, np.int64)

@@ -18,11 +18,11 @@ from device.values import Frame, Image, Mask, Psf
 
 BORDER = 1 / 16  # share of the smaller side; no light of the point should arrive there
 SATURATED_SHARE = 0.95  # of the converter range; brighter pixels are clipped
-LEAST_PEAK = 0.2  # of the converter range, in the shortest exposure: below it noise hides the tails
-MOST_MOVED_PX = 0.5  # from the first frame
-MOST_PEDESTAL = 0.005  # of the PSF's sum (NUMERICS.md 3.5, item 6)
+MIN_PEAK = 0.2  # of the converter range, in the shortest exposure: below it noise hides the tails
+MAX_MOVED_PX = 0.5  # from the first frame
+MAX_PEDESTAL = 0.005  # of the PSF's sum (NUMERICS.md 3.5, item 6)
 CENTROID_THRESHOLD = 0.1  # of the peak: threshold of the centroid
-LEAST_OTF = 0.1  # OTF of the disc: below it deconvolution would amplify noise, not sharpen
+MIN_OTF = 0.1  # OTF of the disc: below it deconvolution would amplify noise, not sharpen
 
 
 @dataclass
@@ -41,8 +41,9 @@ class MotionCheck:
 
     def _note(self, frame: Frame) -> None:
         self.centroids_px.append(centroid_px(frame.counts - self.dark_dn))
-        first, last = self.centroids_px[0], self.centroids_px[-1]
-        if (moved_px := hypot(last[0] - first[0], last[1] - first[1])) > MOST_MOVED_PX:
+        first = self.centroids_px[0]
+        last = self.centroids_px[-1]
+        if (moved_px := hypot(last[0] - first[0], last[1] - first[1])) > MAX_MOVED_PX:
             raise CalibrationRefused(
                 f"the point source has moved by {moved_px:.1f} pixels by frame {frame.number}",
                 "Fix source and head to one table, let them rest, then start again.",
@@ -132,9 +133,9 @@ def subtract_pedestal(light: Image, bad: Mask) -> tuple[Image, float, float, flo
     cleared = light - np.float32(level)
     mass = float(cleared.sum(dtype=np.float64))
     residual = max(abs(float(side.mean()) - level) for side in sides) * light.size / mass
-    if mass <= 0 or residual > MOST_PEDESTAL:
+    if mass <= 0 or residual > MAX_PEDESTAL:
         raise CalibrationRefused(
-            f"the border of the frame is uneven by {residual:.2%} of the point's light (at most {MOST_PEDESTAL:.1%})",
+            f"the border of the frame is uneven by {residual:.2%} of the point's light (at most {MAX_PEDESTAL:.1%})",
             "Tilt the source until its disc is in the middle of the frame, and shade it: light reaches the border.",
         )
     floor = float(np.concatenate(sides).std()) / float(cleared.max())
@@ -150,7 +151,7 @@ def deconvolve_disc(light: Image, disc_px: float) -> Image:
     radius = np.hypot(fft.fftfreq(rows)[:, None], fft.rfftfreq(cols))
     x = np.maximum(np.pi * disc_px * radius, 1e-6)
     otf = np.where(x < 3.8317, 2 * j1(x) / x, 0.0)
-    inverse: NDArray[np.float64] = otf * (1 + LEAST_OTF**2) / (otf**2 + LEAST_OTF**2)
+    inverse: NDArray[np.float64] = otf * (1 + MIN_OTF**2) / (otf**2 + MIN_OTF**2)
     sharp: Image = fft.irfft2(fft.rfft2(light) * inverse.astype(np.float32), light.shape)
     return sharp.astype(np.float32)
 
@@ -171,7 +172,8 @@ def centroid_px(light: Image) -> tuple[float, float]:
 def shift_by_pixels(light: Image, off_px: tuple[int, int]) -> Image:
     """Return the image moved by -`off_px` (rows, cols), whole pixels; pixels from beyond the edge are zero."""
     out = np.zeros_like(light)
-    into, of = [], []
+    into = []
+    of = []
     for size, by in zip(light.shape, off_px, strict=True):
         into.append(slice(max(-by, 0), size - max(by, 0)))
         of.append(slice(max(by, 0), size - max(-by, 0)))
@@ -183,11 +185,12 @@ def refuse_level(shortest: Moments, darks: Darks, flats: Flats) -> None:
     """Raise CalibrationRefused if the point source is too dark or too bright in the given (shortest) exposure."""
     bad = darks.hot | flats.dead
     signal = np.where(bad, 0, shortest.mean_dn - darks.at(shortest.exposure_s))
-    peak_dn, white_dn = float(signal.max()), flats.white_dn - darks.black_dn
-    if peak_dn < LEAST_PEAK * white_dn:
+    peak_dn = float(signal.max())
+    white_dn = flats.white_dn - darks.black_dn
+    if peak_dn < MIN_PEAK * white_dn:
         raise CalibrationRefused(
             f"the point source is too dark: {peak_dn:.0f} DN at {shortest.exposure_s:.3g} s (at least "
-            f"{LEAST_PEAK * white_dn:.0f})",
+            f"{MIN_PEAK * white_dn:.0f})",
             "Take the cap off and put a brighter point source on the axis.",
         )
     if (full := int(((shortest.highest >= SATURATED_SHARE * flats.white_dn) & ~bad).sum())) > 0:

@@ -30,7 +30,8 @@ class RawRecorder:
 
     def __init__(self, folder: Path, show_message: Callable[[str], None], reserve_bytes: int = RESERVE_BYTES) -> None:
         self.folder, self.show_message, self.reserve_bytes = folder, show_message, reserve_bytes
-        self.frame_count, self.failed = 0, False
+        self.frame_count = 0
+        self.failed = False
         self._step = folder
 
     def begin_step(self, step: str) -> None:

@@ -40,7 +40,8 @@ class StepExposures:
 
         The exposure is at most `longest_s`. Raises CalibrationRefused if even that yields a share below `least`.
         """
-        good, top_dn = ~darks.hot, self.spec.white_dn - darks.black_dn
+        good = ~darks.hot
+        top_dn = self.spec.white_dn - darks.black_dn
         exposure_s = min(self.spec.exposure_s, longest_s)
         for _ in range(10):
             seen = self.moments(exposure_s, 1)  # refuses another sensor mode, and a lit lamp

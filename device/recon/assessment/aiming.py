@@ -6,14 +6,14 @@ from typing import Literal
 
 import numpy as np
 
-from device.recon.assessment.frame_quality import LEAST_COVERAGE, LEAST_WIDE, MOST_WIDE, ONE_SIDED, FrameFigures
-from device.recon.assessment.image_quality import LEAST_THROUGH, MOST_SATURATED
+from device.recon.assessment.frame_quality import MAX_WIDE, MIN_COVERAGE, MIN_WIDE, ONE_SIDED, FrameFigures
+from device.recon.assessment.image_quality import MAX_SATURATED, MIN_THROUGH
 from device.values import Image
 
 AimCode = Literal["ready", "noeye", "closer", "back", "left", "right", "up", "down", "still", "dark", "bright"]
 MIN_DISPLAY_S = 0.7  # minimum display time of an instruction, so that it can be read
-LEAST_E_PER_UM2 = 0.1  # of a live frame, which gets less light than a picture
-MOST_DEG_PER_SHOT = 0.5  # of motion during one exposure: the size of the finest resolved detail
+MIN_E_PER_UM2 = 0.1  # of a live frame, which gets less light than a picture
+MAX_DEG_PER_SHOT = 0.5  # of motion during one exposure: the size of the finest resolved detail
 MAX_FRAME_GAP_S = 1.0  # longest interval between two frames for an estimate of the speed
 FIELD_MARGIN = 0.85
 VESSELS = (4, 20)  # cycles across the picture: lower is illumination, higher is noise
@@ -37,7 +37,8 @@ class AimingGuide:
     """
 
     def __init__(self, shot_s: float, deg_per_sample: float | None) -> None:
-        self._most_deg_per_s, self._deg_per_sample = MOST_DEG_PER_SHOT / shot_s, deg_per_sample
+        self._most_deg_per_s = MAX_DEG_PER_SHOT / shot_s
+        self._deg_per_sample = deg_per_sample
         self._before: Image | None = None
         self._before_s = self._since_s = float("-inf")
         self._moved_deg_per_s: float | None = None
@@ -72,9 +73,11 @@ class AimingGuide:
 
     def _speed_between_deg_per_s(self, reading: FrameFigures, picture: Image | None, now_s: float) -> float | None:
         """Return the speed of the picture in degrees per second since the previous frame; None if unknown."""
-        before, before_s = self._before, self._before_s
-        is_eye = picture is not None and reading.through is not None and reading.through >= LEAST_THROUGH
-        self._before, self._before_s = (picture.copy() if picture is not None and is_eye else None), now_s
+        before = self._before
+        before_s = self._before_s
+        is_eye = picture is not None and reading.through is not None and reading.through >= MIN_THROUGH
+        self._before = picture.copy() if picture is not None and is_eye else None
+        self._before_s = now_s
         step_s = now_s - before_s
         if before is None or self._before is None or self._deg_per_sample is None or not 0 < step_s < MAX_FRAME_GAP_S:
             return None
@@ -83,11 +86,11 @@ class AimingGuide:
 
 def _instruction(seen: FrameFigures, is_moving: bool) -> AimCode:
     """Return the code of the first rule that applies: dark, bright, no eye, direction, distance, motion, ready."""
-    if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < LEAST_E_PER_UM2 and seen.saturated == 0:
-        return "noeye" if seen.through is None or seen.through < LEAST_THROUGH else "dark"
-    if seen.saturated > MOST_SATURATED:
+    if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < MIN_E_PER_UM2 and seen.saturated == 0:
+        return "noeye" if seen.through is None or seen.through < MIN_THROUGH else "dark"
+    if seen.saturated > MAX_SATURATED:
         return "bright"
-    if seen.through is not None and seen.through < LEAST_THROUGH:
+    if seen.through is not None and seen.through < MIN_THROUGH:
         return "noeye"
     if (direction := _direction(seen)) is not None:
         return direction
@@ -96,16 +99,17 @@ def _instruction(seen: FrameFigures, is_moving: bool) -> AimCode:
 
 def _direction(seen: FrameFigures) -> AimCode | None:
     """Return the direction in which the camera must move, sideways before "closer" or "back"; None if none."""
-    right, down = seen.off_x or 0.0, seen.off_y or 0.0
+    right = seen.off_x or 0.0
+    down = seen.off_y or 0.0
     if hypot(right, down) > ONE_SIDED:
         if abs(right) > abs(down):
             return "right" if right > 0 else "left"
         return "down" if down > 0 else "up"
-    if seen.wide is not None and seen.wide > MOST_WIDE:
+    if seen.wide is not None and seen.wide > MAX_WIDE:
         return "closer"
-    if seen.wide is not None and seen.wide < LEAST_WIDE:
+    if seen.wide is not None and seen.wide < MIN_WIDE:
         return "back"
-    return "closer" if seen.coverage is not None and seen.coverage < LEAST_COVERAGE else None
+    return "closer" if seen.coverage is not None and seen.coverage < MIN_COVERAGE else None
 
 
 def moved_samples(before: Image, now: Image) -> float:

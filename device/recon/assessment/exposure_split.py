@@ -18,17 +18,17 @@ NUMERICS.md 9.3.
 from dataclasses import dataclass
 from math import log2, pow
 
-from device.recon.assessment.frame_quality import LEAST_E_PER_UM2
+from device.recon.assessment.frame_quality import MIN_E_PER_UM2
 
-MOST_FRAMES = 8  # of a press: what the fit rests on
-LEAST_MOTION_DEG = 0.257  # of a split, during one exposure: 4 pixels of the paper's sensor
-LEAST_GAIN_DB = 0.16  # the largest error of the fit
-LEAST_PART_E_PER_UM2 = 1.25 * LEAST_E_PER_UM2  # of one frame, which the frame quality must not call dark
+MAX_FRAMES = 8  # of a press: what the fit rests on
+MIN_MOTION_DEG = 0.257  # of a split, during one exposure: 4 pixels of the paper's sensor
+MIN_GAIN_DB = 0.16  # the largest error of the fit
+MIN_PART_E_PER_UM2 = 1.25 * MIN_E_PER_UM2  # of one frame, which the frame quality must not call dark
 
 REFERENCE_E_PER_UM2, BLUR_DEG, BLUR_DB, BLUR_POWER = 220.0, 0.372, 2.0, 0.34
-DISPLACED_DB, MOST_DISPLACED_DB = 0.2, 0.55
+DISPLACED_DB, MAX_DISPLACED_DB = 0.2, 0.55
 FRAME_DB, FRAME_POWER = 0.0106, 0.7
-MOST_DARK_RATIO = 1.5  # a frame of twice the exposure has twice the dark current
+MAX_DARK_RATIO = 1.5  # a frame of twice the exposure has twice the dark current
 HALVING_DB = 0.7  # of half the light, measured with one and two frames of six photographs
 
 
@@ -68,24 +68,24 @@ def choose_split(
     """Return how to split each of the `count` exposures of a press, `exposure_s` seconds each.
 
     `speed_deg_per_s`: of the eye in the aiming stream; None, or nothing `known` of the light: then nothing is split. A
-    split press has at most MOST_FRAMES lit frames, each with enough light of its own, and is chosen for the largest
-    predicted gain, at least LEAST_GAIN_DB, if the eye moves by more than LEAST_MOTION_DEG during one exposure. The lamp
+    split press has at most MAX_FRAMES lit frames, each with enough light of its own, and is chosen for the largest
+    predicted gain, at least MIN_GAIN_DB, if the eye moves by more than MIN_MOTION_DEG during one exposure. The lamp
     is on for as long as for the whole exposures: parts and overheads fill the time of an exposure and one overhead.
     """
     if speed_deg_per_s is None or known is None or known.light_e_per_um2_s <= 0:
         return WHOLE
     motion_deg = speed_deg_per_s * exposure_s
-    if motion_deg <= LEAST_MOTION_DEG:
+    if motion_deg <= MIN_MOTION_DEG:
         return WHOLE
-    possible = [_split(count, parts, exposure_s, motion_deg, known) for parts in range(2, MOST_FRAMES // count + 1)]
+    possible = [_split(count, parts, exposure_s, motion_deg, known) for parts in range(2, MAX_FRAMES // count + 1)]
     best = max((one for one in possible if one is not None), key=lambda one: one.gain_db, default=WHOLE)
-    return best if best.gain_db >= LEAST_GAIN_DB else WHOLE
+    return best if best.gain_db >= MIN_GAIN_DB else WHOLE
 
 
 def _split(count: int, parts: int, exposure_s: float, motion_deg: float, known: PressLight) -> ExposureSplit | None:
     """Return the split into so many parts; None if a part would have too little light."""
     part_s = (exposure_s + known.overhead_s) / parts - known.overhead_s
-    if known.light_e_per_um2_s * part_s < LEAST_PART_E_PER_UM2:
+    if known.light_e_per_um2_s * part_s < MIN_PART_E_PER_UM2:
         return None
     light_e_per_um2 = count * known.light_e_per_um2_s * exposure_s
     whole_db = loss_db(count, count * motion_deg, light_e_per_um2)
@@ -102,7 +102,7 @@ def loss_db(frames: int, motion_deg: float, light_e_per_um2: float) -> float:
     relative = REFERENCE_E_PER_UM2 / light_e_per_um2
     moved = motion_deg / (BLUR_DEG * pow(relative, BLUR_POWER))
     blur_db = BLUR_DB * moved**2 / (moved**2 + frames**2)
-    displaced_db = min(DISPLACED_DB * ((frames - 1) / frames * moved) ** 2, MOST_DISPLACED_DB)
+    displaced_db = min(DISPLACED_DB * ((frames - 1) / frames * moved) ** 2, MAX_DISPLACED_DB)
     return blur_db + displaced_db + FRAME_DB * (frames - 1) * pow(relative, FRAME_POWER)
 
 
@@ -112,4 +112,4 @@ def dark_fits(exposure_s: float, dark_s: float) -> bool:
     A dark frame that is too long is accepted. That of a split press has the exposure of one part, which is at most half
     the exposure of the frames in other colours.
     """
-    return exposure_s <= MOST_DARK_RATIO * dark_s
+    return exposure_s <= MAX_DARK_RATIO * dark_s

@@ -21,7 +21,7 @@ from device.values import Image
 
 RIDGE = 1e-6
 NARROW = 0.28  # samples by which the fit underestimates the radius, at 20 and at 40 um a sample: the field edge is soft
-LEAST_WEIGHT = 0.03  # of the maximum of an even field, added for the read noise
+MIN_WEIGHT = 0.03  # of the maximum of an even field, added for the read noise
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +50,8 @@ class FieldEdgeFit:
         outward = edge[0] * down[:, None] + edge[1] * right[None]
         all_modes = (*modes(model), outward.astype(np.float32))
         self._spectra: list[Spectrum] = [scipy_fft.rfft2(np.asarray(mode)).astype(np.complex64) for mode in all_modes]
-        self._rows, self._cols = np.fft.fftfreq(model.grid.shape[0])[:, None], np.fft.rfftfreq(model.grid.shape[1])
+        self._rows = np.fft.fftfreq(model.grid.shape[0])[:, None]
+        self._cols = np.fft.rfftfreq(model.grid.shape[1])
         frequency = np.hypot(self._rows, self._cols)
         self._beyond = (frequency < low) | (frequency > high)
 
@@ -61,7 +62,7 @@ class FieldEdgeFit:
         seen = [self._seen(spectrum * turn, between) for spectrum in self._spectra]
         seen.append(np.full_like(seen[0], seen[0].max()))  # stray light
         design = np.stack(seen)
-        weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + LEAST_WEIGHT)
+        weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + MIN_WEIGHT)
         normal = (design * weights) @ design.T
         normal[np.diag_indices_from(normal)] *= 1 + RIDGE
         found = np.linalg.solve(normal, (design * weights) @ blocks(y, BLOCK).ravel())
@@ -82,13 +83,16 @@ class FieldEdgeFit:
         product[self._beyond] = 0
         match: Floats = scipy_fft.irfft2(product, grid.shape).astype(np.float64)
         at = np.unravel_index(int(np.argmax(match)), match.shape)
-        rows, cols = match[:, at[1]], match[at[0]]
+        rows = match[:, at[1]]
+        cols = match[at[0]]
         return _vertex(rows, int(at[0])), _vertex(cols, int(at[1]))
 
 
 def _vertex(line: Floats, at: int) -> float:
     """Return the position of a periodic line's maximum around its sample `at`, from minus to plus half its length."""
-    left, middle, right = line[at - 1], line[at], line[(at + 1) % line.size]
+    left = line[at - 1]
+    middle = line[at]
+    right = line[(at + 1) % line.size]
     curvature = left - 2 * middle + right
     place = at + (0.5 * float((left - right) / curvature) if curvature < 0 else 0.0)
     return place - line.size if place > line.size / 2 else place

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from device.errors import FrameError
-from device.recon.assessment.image_quality import LEAST_THROUGH, MOST_SATURATED
+from device.recon.assessment.image_quality import MAX_SATURATED, MIN_THROUGH
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
@@ -42,11 +42,11 @@ Code = Literal[
 # Limits. Detection and false-alarm rates: tests/hard/test_frame_quality.py.
 # `wide` of a saturated frame: overexposure flattens its middle; a reflex, which is small, does not.
 LARGEST_SPOT, SPOT, SPOT_PER_SHARE = 0.15, 0.975, 0.6
-LEAST_E_PER_UM2 = 0.5  # a human eye's photon budget gives 3.0, and a PCC of 0.91; 0.3 gives 0.81, 0.1 gives 0.67
-LEAST_COVERAGE = 0.9  # good fields have 0.975 and more
-LEAST_WIDE, MOST_WIDE = 0.93, 1.025  # good fields have 0.97 to 1.005
+MIN_E_PER_UM2 = 0.5  # a human eye's photon budget gives 3.0, and a PCC of 0.91; 0.3 gives 0.81, 0.1 gives 0.67
+MIN_COVERAGE = 0.9  # good fields have 0.975 and more
+MIN_WIDE, MAX_WIDE = 0.93, 1.025  # good fields have 0.97 to 1.005
 ONE_SIDED = 0.1
-MOST_SMEAR = 0.22
+MAX_SMEAR = 0.22
 MAX_MEASURABLE_SATURATION = 0.25  # share of saturated pixels above which no other figure is valid
 FIELD_SAMPLES = 64  # across the field, at the least
 SMEAR_CYCLES = (12, 40)  # across the field: higher is noise, lower is the illumination
@@ -95,7 +95,7 @@ def assess_picture(first: Verdict, residual: float | None, coverage: float | Non
     """
     numbers = first.numbers | _rounded({"residual": residual, "lit": coverage})
     code = first.code
-    if code is None and coverage is not None and coverage < LEAST_COVERAGE:
+    if code is None and coverage is not None and coverage < MIN_COVERAGE:
         code = "shot.edge"
     if code is not None and tries >= retakes:
         code = "shot.poor"
@@ -116,16 +116,16 @@ def shows_eye(numbers: Mapping[str, Any]) -> bool:
 
 
 def _cause(seen: FrameFigures, eye_before: bool) -> Code | None:
-    if seen.saturated > MOST_SATURATED:
+    if seen.saturated > MAX_SATURATED:
         narrow = seen.wide is not None and seen.wide < SPOT + SPOT_PER_SHARE * seen.saturated
         return "shot.halo" if narrow and seen.saturated < LARGEST_SPOT else "shot.saturated"
-    if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < LEAST_E_PER_UM2:
+    if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < MIN_E_PER_UM2:
         return "shot.dark"
-    if seen.through is not None and seen.through < LEAST_THROUGH:
+    if seen.through is not None and seen.through < MIN_THROUGH:
         return "shot.blink" if eye_before else "shot.noeye"
     if _is_cut(seen):
         return "shot.edge" if hypot(seen.off_x or 0.0, seen.off_y or 0.0) > ONE_SIDED else "shot.pupil"
-    return "shot.moved" if seen.smear is not None and seen.smear > MOST_SMEAR else None
+    return "shot.moved" if seen.smear is not None and seen.smear > MAX_SMEAR else None
 
 
 def _rounded(numbers: dict[str, float | None]) -> dict[str, Any]:
@@ -135,8 +135,8 @@ def _rounded(numbers: dict[str, float | None]) -> dict[str, Any]:
 
 def _is_cut(seen: FrameFigures) -> bool:
     """Return True if a part of the field is dark: `wide` is outside its limits, or `coverage` is too low."""
-    narrow = seen.wide is not None and not LEAST_WIDE < seen.wide < MOST_WIDE
-    return narrow or (seen.coverage is not None and seen.coverage < LEAST_COVERAGE)
+    narrow = seen.wide is not None and not MIN_WIDE < seen.wide < MAX_WIDE
+    return narrow or (seen.coverage is not None and seen.coverage < MIN_COVERAGE)
 
 
 class FrameQualityGate:
@@ -146,7 +146,8 @@ class FrameQualityGate:
     """
 
     def __init__(self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int = 0) -> None:
-        self._sensor, self._geometry = calibration.sensor, calibration.geometry
+        self._sensor = calibration.sensor
+        self._geometry = calibration.geometry
         radius_px = field_radius_px(calibration)
         self._field: _CoarseField | None = None
         if isfinite(radius_px):
@@ -156,7 +157,7 @@ class FrameQualityGate:
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> FrameFigures:
         """Return the figures of a frame (colour: of the brightest channel); `counts` and `dark` as for `Reconstructor`.
-        FrameError for another shape, or if too many pixels are missing but at most MOST_SATURATED are saturated.
+        FrameError for another shape, or if too many pixels are missing but at most MAX_SATURATED are saturated.
         """
         counts, dark = brightest(counts, dark)
         saturated = float((counts >= self._sensor.white_dn).mean())
@@ -168,7 +169,7 @@ class FrameQualityGate:
         try:
             return self._field.read(brightness, counts, dark, self._defects(counts, dark))
         except FrameError:
-            if saturated <= MOST_SATURATED:
+            if saturated <= MAX_SATURATED:
                 raise
             return brightness  # too few pixels are left because of the saturation
 
@@ -197,7 +198,8 @@ class _CoarseField:
         self._prepare = Preprocessor(calibration, model.grid)
         self._even_radius = _rms_radius(model.flat)
         self._picture: Image = np.zeros(model.grid.shape, np.float32)
-        self._shown, self.bin = model.grid.shown, model.grid.n
+        self._shown = model.grid.shown
+        self.bin = model.grid.n
         self.shown: Image = self._picture[self._shown]
         radius = model.grid.radius_samples
         rows, cols = (
@@ -218,8 +220,9 @@ class _CoarseField:
         self, brightness: FrameFigures, counts: Pixels, dark: Pixels | None, defects: Places | None
     ) -> FrameFigures:
         """Return `brightness` with the figures of the field added; only `wide` if the frame is overexposed."""
-        picture, solver = self._picture, self._solver
-        if brightness.saturated > MOST_SATURATED:
+        picture = self._picture
+        solver = self._solver
+        if brightness.saturated > MAX_SATURATED:
             frame = self._prepare(counts, dark)  # with all light, halos included
             full = (1 - frame.good) * np.float32(self._span_dn)
             return replace(brightness, wide=_rms_radius(frame.y + full) / self._even_radius)
@@ -244,7 +247,8 @@ class _CoarseField:
 
     def _smear(self, shown: Image) -> float | None:
         """Return the directional dependence of the detail's power: 0 for none, 1 for one direction; None if dark."""
-        window, mean = self._window, float((shown * self._window).sum(dtype=np.float64)) / float(self._window.sum())
+        window = self._window
+        mean = float((shown * self._window).sum(dtype=np.float64)) / float(self._window.sum())
         if mean <= 0:
             return None
         power = np.abs(np.fft.rfft2((shown / mean - 1) * window))[self._band] ** 2 * self._weight
@@ -261,9 +265,11 @@ def brightest(counts: Pixels, dark: Pixels | None) -> tuple[Pixels, Pixels | Non
 
 def _rms_radius(light: Image) -> float:
     """Return the rms distance of the light from its centroid in samples."""
-    total, squared = max(float(light.sum(dtype=np.float64)), 1e-9), 0.0
+    total = max(float(light.sum(dtype=np.float64)), 1e-9)
+    squared = 0.0
     for axis in (0, 1):
-        profile, place = light.sum(axis=1 - axis, dtype=np.float64), np.arange(light.shape[axis])
+        profile = light.sum(axis=1 - axis, dtype=np.float64)
+        place = np.arange(light.shape[axis])
         middle = float(profile @ place) / total
         squared += float(profile @ (place - middle) ** 2) / total
     return float(max(squared, 1e-9) ** 0.5)

@@ -7,21 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from device.recon.assessment.psf_consistency import MOST_MISSING, Match
+from device.recon.assessment.psf_consistency import MAX_MISSING, Match
 from device.recon.estimation.power_law_prior import BINS, PowerLaw, PowerLawPrior
 from device.values import Geometry, Image, Mask
 
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; OPTICS.md 1.1
-LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
+MIN_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 MISMATCH_SD = 3.0  # standard errors
-LEAST_LIT = 0.75  # share of the field
+MIN_LIT = 0.75  # share of the field
 SQUARES = 64  # across the field, each of which is lit or dark
 NEAR_SQUARES = 5  # side of the surroundings of one: in little light a single square is noise
-MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
-MOST_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
+MAX_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
+MAX_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
 NOISE_PARTS = 5  # frames without flicker have up to 3.6, at 250 electrons; 2 % of flicker there 17
-MOST_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the spectrum rise as the picture gets worse
-MOST_SATURATED = 0.001  # share of the pixels
+MAX_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the spectrum rise as the picture gets worse
+MAX_SATURATED = 0.001  # share of the pixels
 # Figures that use the PSF: set to None if the model does not explain the frame.
 PSF_FIGURES = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")
 SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
@@ -129,50 +129,51 @@ def banding(left: Image, noise_dn2: float, light_dn: float) -> float:
 
 
 def is_banded(quality: dict[str, float | None]) -> bool:
-    """Return True if `banding` exceeds MOST_BANDING; False if it is unknown."""
+    """Return True if `banding` exceeds MAX_BANDING; False if it is unknown."""
     share = quality.get("banding")
-    return share is not None and share > MOST_BANDING
+    return share is not None and share > MAX_BANDING
 
 
 def is_explained(quality: dict[str, float | None], match: Match | None, misfit: float | None) -> bool:
     """Return True if the forward model fits the frame; figures that use the PSF are valid only then.
 
     False if the PSF does not match, the light did not come through the eye, `misfit` (rms residual in units of the
-    noise) is above MOST_MISFIT, or the light flickered.
+    noise) is above MAX_MISFIT, or the light flickered.
     """
     through = quality.get("through")
-    seen = through is None or through >= LEAST_THROUGH
-    fits = (misfit is None or misfit <= MOST_MISFIT) and not is_banded(quality)
+    seen = through is None or through >= MIN_THROUGH
+    fits = (misfit is None or misfit <= MAX_MISFIT) and not is_banded(quality)
     return seen and match not in MISMATCHES and fits
 
 
 def is_lit(quality: dict[str, float | None]) -> bool:
     """Return True if the lit share of the field is sufficient for estimates that use its edge, or unknown."""
     share = quality.get("coverage")
-    return share is None or share >= LEAST_LIT
+    return share is None or share >= MIN_LIT
 
 
 def is_measured(name: str, quality: dict[str, float | None]) -> bool:
     """Return True if the figure `name`, one of PSF_FIGURES, is valid for a frame that the model explains.
 
-    `coverage` always is. The others are valid if the field is lit and at most MOST_UNSEEN of the frame is missing, the
+    `coverage` always is. The others are valid if the field is lit and at most MAX_UNSEEN of the frame is missing, the
     resolution also only if the frame has the PSF's structure: the power of a glare's halo would count as detail.
     """
     if name == "coverage":
         return True
     is_foreign = name in SPECTRUM_FIGURES and (quality.get("structure_sure") or 0.0) < -MISMATCH_SD
-    return is_lit(quality) and (quality.get("missing") or 0.0) <= MOST_UNSEEN and not is_foreign
+    return is_lit(quality) and (quality.get("missing") or 0.0) <= MAX_UNSEEN and not is_foreign
 
 
 def psf_match(quality: dict[str, float | None]) -> Match:
     """Return FOREIGN if `structure_sure` is below -MISMATCH_SD, else UNKNOWN; for frames without a consistency check.
 
-    UNKNOWN also if more than MOST_MISSING of the frame is missing, because gaps have a spectrum of their own, and if no
+    UNKNOWN also if more than MAX_MISSING of the frame is missing, because gaps have a spectrum of their own, and if no
     ring of frequencies is above the noise: below 250 electrons at the peak the right PSF has -5 to 1.
     """
-    sure, missing = quality.get("structure_sure"), quality.get("missing") or 0.0
+    sure = quality.get("structure_sure")
+    missing = quality.get("missing") or 0.0
     is_seen = (quality.get("cutoff_per_px") or 0.0) > 0
-    surely_foreign = sure is not None and sure < -MISMATCH_SD and is_seen and missing <= MOST_MISSING
+    surely_foreign = sure is not None and sure < -MISMATCH_SD and is_seen and missing <= MAX_MISSING
     return Match.FOREIGN if surely_foreign else Match.UNKNOWN
 
 
@@ -186,10 +187,10 @@ def quality_warnings(
     """
     found = []
     explained = is_explained(quality, match, misfit)
-    if (quality["saturated"] or 0) > MOST_SATURATED:
+    if (quality["saturated"] or 0) > MAX_SATURATED:
         found.append("saturated")
     through = quality.get("through")
-    if through is not None and through < LEAST_THROUGH:
+    if through is not None and through < MIN_THROUGH:
         found.append("diffuse")
     elif match in MISMATCHES:
         found.append("mismatch")

@@ -15,13 +15,13 @@ from scipy import ndimage
 from device.values import Eye, Image, Mask
 
 SAMPLES_PER_DEG = 4.0  # of the reduced copy, at least; a vein is 0.4 deg wide
-LEAST_PER_DEG = 3.0  # coarser pictures do not resolve vessels
+MIN_PER_DEG = 3.0  # coarser pictures do not resolve vessels
 COARSE_PER_DEG = 2.0  # for structures of the size of a disc or a macula
 BESIDE_DEG = 4.0  # above and below the centre of the disc, where the vessels are outside it
 FOVEA_DEG = (2.0, -15.0)  # from the disc of a right eye: down, right
 ABOUT_DEG = 2.5  # tolerance of that position: anatomy, and tilt of the head
 DISC_DEG = 5.0  # structures farther from the disc's centre are not part of it
-LEAST_OFF_DEG = 4.0  # with a disc nearer to the centre the picture is nerve-centred: no estimate
+MIN_OFF_DEG = 4.0  # with a disc nearer to the centre the picture is nerve-centred: no estimate
 RIM_DEG = 0.8  # width of the ignored edge of the field
 FAINT = 1e-6
 RIGHT: Eye = "OD"
@@ -68,7 +68,8 @@ class Signs:
         """
         if self.macula is None or self.peak <= self.rival:
             return 0.0
-        peak, rival = max(self.peak, FAINT), max(self.rival, FAINT)
+        peak = max(self.peak, FAINT)
+        rival = max(self.rival, FAINT)
         weakest = min(
             PEAK_STEEP * log(peak / PEAK),
             RIVAL_STEEP * log(peak / rival / RIVAL),
@@ -85,7 +86,7 @@ def laterality(picture: Image, px_per_deg: float, field_deg: float) -> Lateralit
     too coarse or has values that are not finite.
     """
     narrow = min(picture.shape) < px_per_deg * field_deg / 2
-    if narrow or px_per_deg < LEAST_PER_DEG or not np.isfinite(picture).all():
+    if narrow or px_per_deg < MIN_PER_DEG or not np.isfinite(picture).all():
         return Laterality(None, 0.0)
     n = max(1, int(px_per_deg / SAMPLES_PER_DEG))
     right, left = (signs(_reduced(seen, n), px_per_deg / n, field_deg) for seen in (picture, picture[:, ::-1]))
@@ -109,15 +110,17 @@ def signs(picture: Image, per_deg: float, field_deg: float) -> Signs:
     filled = ndimage.grey_closing(logs, size=(spot, spot)) * field  # removes vessels: narrower, and dark
 
     m = max(1, round(per_deg / COARSE_PER_DEG))
-    weight, per_deg = _reduced(field, m), per_deg / m
+    weight = _reduced(field, m)
+    per_deg = per_deg / m
     light = _flat(np.divide(_reduced(filled, m), weight.clip(FAINT), dtype=np.float32), weight, per_deg)
     around = _mean(light, weight, 4.0 * per_deg)
     disc = np.maximum(_mean(light, weight, 1.6 * per_deg) - around, 0) * _reduced(vessels, m)
     dark = around - _mean(light, weight, 1.5 * per_deg)
     down, right, away = _degrees(disc.shape, per_deg)
     allowed = away < field_deg / 2 - RIM_DEG
-    row, col = np.unravel_index(np.argmax(np.where(allowed & (right > LEAST_OFF_DEG), disc, -1)), disc.shape)
-    y, x = down[row, 0], right[0, col]
+    row, col = np.unravel_index(np.argmax(np.where(allowed & (right > MIN_OFF_DEG), disc, -1)), disc.shape)
+    y = down[row, 0]
+    x = right[0, col]
     beyond = allowed & (np.hypot(down - y, right - x) > DISC_DEG)
     about = np.hypot(down - y - FOVEA_DEG[0], right - x - FOVEA_DEG[1]) < ABOUT_DEG
     about &= away < field_deg / 2 - 2 * RIM_DEG
@@ -172,7 +175,8 @@ def _upright_vessels(logs: Image, inside: Mask, per_deg: float) -> Image:
     usual = max(float(upright[inside].mean(dtype=np.float64)), FAINT)
     near = ndimage.maximum_filter(density, size=(1, 2 * round(2.0 * per_deg) + 1)) / usual
     far = round(BESIDE_DEG * per_deg)
-    above, below = np.zeros_like(near), np.zeros_like(near)
+    above = np.zeros_like(near)
+    below = np.zeros_like(near)
     above[far:], below[:-far] = near[:-far], near[far:]
     vessels: Image = np.sqrt(above * below, dtype=np.float32)
     return vessels

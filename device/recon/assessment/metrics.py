@@ -18,9 +18,10 @@ from device.values import Image, Mask
 
 FIT = "least-squares gain and offset of the picture onto the truth inside the region"
 RANGE = "the truth's span (largest minus smallest value) inside the region"
-SSIM_SIGMA_PX, SSIM_REACH_PX = 1.5, 5  # an 11 x 11 window
+SSIM_SIGMA_PX = 1.5  # an 11 x 11 window
+SSIM_REACH_PX = 5
 K1, K2 = 0.01, 0.03
-MOST_SHIFT_PX = 32
+MAX_SHIFT_PX = 32
 
 Plane = NDArray[np.float64]
 
@@ -47,8 +48,10 @@ class PictureScorer:
     def __init__(self, truth: Image, inside: Mask, detail_px: float, vessels: Mask | None = None) -> None:
         if truth.shape != inside.shape or truth.ndim != 2:
             raise FrameError(f"a truth of the shape {truth.shape} does not fit a region of {inside.shape}")
-        self._shape, self._box = truth.shape, _around(inside)
-        truth, inside = truth[self._box], inside[self._box]  # pixels outside are not used
+        self._shape = truth.shape
+        self._box = _around(inside)
+        truth = truth[self._box]  # pixels outside are not used
+        inside = inside[self._box]
         self.inside = inside & np.isfinite(truth)
         values = truth[self.inside].astype(np.float64)
         span = float(np.ptp(values)) if values.size else 0.0
@@ -57,7 +60,9 @@ class PictureScorer:
                 "the truth is the same everywhere in the region, so nothing can be compared with it",
                 "Give the truth on the sensor's grid: one value per pixel of the raw frame.",
             )
-        self.detail_px, self._low, self.span = detail_px, float(values.min()), span
+        self.detail_px = detail_px
+        self._low = float(values.min())
+        self.span = span
         self.truth: Plane = np.where(self.inside, (np.nan_to_num(truth) - self._low) / span, 0)
         self.vessels = None if vessels is None else vessels[self._box] & self.inside
         self.truth_variance = float(self.truth[self.inside].var())
@@ -104,7 +109,8 @@ def _around(inside: Mask) -> tuple[slice, slice]:
 
 def pcc(x: Plane, truth: Plane, inside: Mask) -> float:
     """Return Pearson's correlation over the region; 0 if one of the two is constant."""
-    a, b = x[inside] - x[inside].mean(), truth[inside] - truth[inside].mean()
+    a = x[inside] - x[inside].mean()
+    b = truth[inside] - truth[inside].mean()
     norm = float(np.sqrt((a @ a) * (b @ b)))
     varies = norm > 1e-12 * inside.sum() * max(
         float(np.abs(x[inside]).max()) * float(np.abs(truth[inside]).max()), 1e-300
@@ -114,7 +120,8 @@ def pcc(x: Plane, truth: Plane, inside: Mask) -> float:
 
 def fit_intensity(x: Plane, truth: Plane, inside: Mask) -> Plane:
     """Return gain x + offset, the least-squares fit of x to the truth inside the region."""
-    a, b = x[inside], truth[inside]
+    a = x[inside]
+    b = truth[inside]
     spread = float(a.var())
     gain = float(((a - a.mean()) * (b - b.mean())).mean()) / spread if spread > 0 else 0.0
     return np.asarray(gain * (x - a.mean()) + b.mean())
@@ -133,8 +140,10 @@ def ssim(fitted: Plane, truth: Plane, core: Mask) -> float:
     the region eroded by five pixels, no pixel outside the region is used.
     """
     blur = _window
-    mean_x, mean_t = blur(fitted), blur(truth)
-    var_x, var_t = blur(fitted * fitted) - mean_x**2, blur(truth * truth) - mean_t**2
+    mean_x = blur(fitted)
+    mean_t = blur(truth)
+    var_x = blur(fitted * fitted) - mean_x**2
+    var_t = blur(truth * truth) - mean_t**2
     cov = blur(fitted * truth) - mean_x * mean_t
     similarity = (2 * mean_x * mean_t + K1**2) * (2 * cov + K2**2)
     similarity /= (mean_x**2 + mean_t**2 + K1**2) * (var_x + var_t + K2**2)
@@ -176,7 +185,7 @@ def shift_px(picture: Image, truth: Image) -> tuple[int, int]:
     spectra = [np.fft.rfft2(image - image.mean()) for image in (np.nan_to_num(picture), np.nan_to_num(truth))]
     product = spectra[0] * np.conj(spectra[1])
     surface = np.fft.irfft2(product / np.sqrt(np.abs(product) + 1e-30), (rows, cols))  # half whitened for a sharp peak
-    down, across = (min(MOST_SHIFT_PX, (size - 1) // 2) for size in (rows, cols))
+    down, across = (min(MAX_SHIFT_PX, (size - 1) // 2) for size in (rows, cols))
     near = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
     row, col = np.unravel_index(int(np.argmax(near)), near.shape)
     return int(row) - down, int(col) - across

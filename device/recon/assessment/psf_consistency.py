@@ -40,18 +40,18 @@ from device.values import Calibration, Image, Psf
 ANGLES_DEG = np.linspace(30, 150, 8)  # of the null PSFs; the other half circle gives the same values with opposite sign
 PROVEN = 5.0  # sd of `orientation` and `mirrored`
 MATCHES, PER_SD = 0.5, 0.035  # least score of a right PSF, and its decrease per sd of `orientation`
-MOST_SD = 0.1  # of a score that proves a mismatch: 0.07 at 144 electrons, 0.25 for noise alone
+MAX_SD = 0.1  # of a score that proves a mismatch: 0.07 at 144 electrons, 0.25 for noise alone
 TAPER_SHARES = (0.25, 0.45)  # of the short side; `score` uses the first
-MOST_BIN = 4
-LEAST_SAMPLES = 64  # of the short side
-MOST_SAMPLES = 400_000
+MAX_BIN = 4
+MIN_SAMPLES = 64  # of the short side
+MAX_SAMPLES = 400_000
 RING = 250  # frequencies, as in `psf_match_any_refraction`
-MOST_MISSING = 0.04  # share of the pixels: with reflexes and 6 to 7 % missing, two frames of 48 scored as foreign
-LEAST_SIGNAL = 1.3  # over the noise; below, right PSFs score as low as foreign ones (500 electrons at the peak: 1.2)
+MAX_MISSING = 0.04  # share of the pixels: with reflexes and 6 to 7 % missing, two frames of 48 scored as foreign
+MIN_SIGNAL = 1.3  # over the noise; below, right PSFs score as low as foreign ones (500 electrons at the peak: 1.2)
 AXIS = 3  # cycles across the frame: bad columns, bad rows and the false edge of a cut-off field are below
 PSF_ERROR = 0.02  # of the mean |H|^2: limits the gain at frequencies that the PSF does not pass
 SCALES = np.arange(-12, 13) * 0.0025 + 1  # of the PSF: eyes of +-8 dpt, or another depth
-LEAST_SPREAD = 1e-7  # below, the PSF equals its own rotation and has no orientation
+MIN_SPREAD = 1e-7  # below, the PSF equals its own rotation and has no orientation
 
 Floats = NDArray[np.float64]
 Spectrum = NDArray[np.complex64]
@@ -91,7 +91,7 @@ class Consistency:
     def match(self) -> Match:
         """Result of the test from score, sd, `orientation` and `mirrored`, with the limit L of the score.
 
-        L = MATCHES - PER_SD |orientation|. If score + 2 sd < L: UNKNOWN for sd > MOST_SD, MIRRORED for |mirrored| >
+        L = MATCHES - PER_SD |orientation|. If score + 2 sd < L: UNKNOWN for sd > MAX_SD, MIRRORED for |mirrored| >
         PROVEN, else FOREIGN. Otherwise: ROTATED for orientation < -PROVEN, CONSISTENT for score - 2 sd > L, else
         UNKNOWN.
         """
@@ -100,7 +100,7 @@ class Consistency:
             if self.orientation < -PROVEN:
                 return Match.ROTATED
             return Match.CONSISTENT if self.score - 2 * self.score_sd > least else Match.UNKNOWN
-        if self.score_sd > MOST_SD:
+        if self.score_sd > MAX_SD:
             return Match.UNKNOWN
         if abs(self.mirrored) > PROVEN:
             return Match.MIRRORED_LEFT_RIGHT if self.mirrored > 0 else Match.MIRRORED_UP_DOWN
@@ -115,16 +115,17 @@ class PsfConsistency:
 
     def __init__(self, calibration: Calibration, shape: Pair, index: int = 0) -> None:
         psf = calibration.psfs[index]
-        n = min(working_bin(psf, STOPBAND_SHARE_OPEN), MOST_BIN)
-        while shape[0] // n * (shape[1] // n) > MOST_SAMPLES:
+        n = min(working_bin(psf, STOPBAND_SHARE_OPEN), MAX_BIN)
+        while shape[0] // n * (shape[1] // n) > MAX_SAMPLES:
             n += 1
-        while n > 1 and min(shape) // n < LEAST_SAMPLES:
+        while n > 1 and min(shape) // n < MIN_SAMPLES:
             n -= 1
         self._grid = Grid.periodic(shape, n, float("inf"))
         self._preparer = Preprocessor(calibration, self._grid)
         self._psf = binned(psf, n)
         rows, cols = self._grid.shape
-        row_cycles, col_cycles = np.abs(np.fft.fftfreq(rows, 1 / rows)), np.fft.rfftfreq(cols, 1 / cols)
+        row_cycles = np.abs(np.fft.fftfreq(rows, 1 / rows))
+        col_cycles = np.fft.rfftfreq(cols, 1 / cols)
         self._frequency = np.hypot(row_cycles[:, None] / rows, col_cycles[None] / cols)
         self._off_axes = (row_cycles > AXIS)[:, None] & (col_cycles > AXIS)[None]
         self._tapers = [taper(self._grid.window, share) for share in TAPER_SHARES]
@@ -136,11 +137,11 @@ class PsfConsistency:
         `DefectFinder`. A FOREIGN result is tested again at the best of SCALES; ROTATED, or CONSISTENT with orientation
         > PROVEN, then replaces it.
 
-        None if a side of the grid has fewer than LEAST_SAMPLES / 2 samples, if the PSF passes too few usable
-        frequencies, or if the result is FOREIGN and either the share of missing pixels is above MOST_MISSING or the
-        mean |Y|^2 is below LEAST_SIGNAL times the noise.
+        None if a side of the grid has fewer than MIN_SAMPLES / 2 samples, if the PSF passes too few usable
+        frequencies, or if the result is FOREIGN and either the share of missing pixels is above MAX_MISSING or the
+        mean |Y|^2 is below MIN_SIGNAL times the noise.
         """
-        if min(self._grid.shape) < LEAST_SAMPLES // 2:
+        if min(self._grid.shape) < MIN_SAMPLES // 2:
             return None
         plane = counts if counts.ndim == 2 else counts.mean(axis=2).astype(np.float32)
         frame = self._preparer(plane, None, defects)
@@ -154,18 +155,20 @@ class PsfConsistency:
         rotated = again is not None and again.match is Match.ROTATED
         if proven or rotated:
             return again
-        return found if frame.missing <= MOST_MISSING and self._signal(spectra[0]) >= LEAST_SIGNAL else None
+        return found if frame.missing <= MAX_MISSING and self._signal(spectra[0]) >= MIN_SIGNAL else None
 
     def _signal(self, spectrum: Spectrum) -> float:
         """Return the mean |Y|^2 in the band over the noise per frequency: 1 for noise only."""
-        power, seen = _power(self._otf(self._psf)), _power(spectrum)
+        power = _power(self._otf(self._psf))
+        seen = _power(spectrum)
         low, high = band(self._frequency, power, max(self._grid.window))
         inside = (self._frequency > low) & (self._frequency < high) & self._off_axes
         return float(seen[inside].mean()) / max(self._noise(seen, power), 1e-30)
 
     def _tapered_spectra(self, frame: Linear) -> list[Spectrum]:
         """Return the spectrum of the tapered frame minus its mean, for each taper; 0 near the frequency axes."""
-        y, spectra = filled(frame.y, frame.good), []
+        y = filled(frame.y, frame.good)
+        spectra = []
         for window in self._tapers:
             mean = float((y * window).sum() / window.sum())
             spectrum = scipy_fft.rfft2((y - np.float32(mean)) * window)
@@ -186,7 +189,7 @@ class PsfConsistency:
         amplitudes = [self._deconvolved_amplitude(spectrum, otf) for spectrum in spectra]
         differences = np.array([self._sparsity_differences(amplitudes, self._otf(image)) for image in images])
         spread = np.sqrt((differences[2:] ** 2).mean(axis=0))
-        if spread.min() < LEAST_SPREAD:
+        if spread.min() < MIN_SPREAD:
             return Consistency(score, sd, 0.0, 0.0)
         total = (differences / spread).sum(axis=1)
         total /= np.sqrt((total[2:] ** 2).mean())
@@ -198,7 +201,8 @@ class PsfConsistency:
         The estimator of `psf_match_any_refraction`, with the rings summed at once for the search over SCALES: another
         order of the sums, so the last bits differ. (0, inf) without usable frequencies.
         """
-        power, seen = _power(otf), _power(spectrum)
+        power = _power(otf)
+        seen = _power(spectrum)
         low, high = band(self._frequency, power, max(self._grid.window))
         noise = self._noise(seen, power)
         inside = np.flatnonzero((self._frequency > low) & (self._frequency < high) & self._off_axes)
@@ -207,7 +211,8 @@ class PsfConsistency:
         if order.size < RING or not noise > 0:
             return 0.0, float("inf")
         counts = np.diff(np.append(starts, order.size))
-        energy, power = seen.ravel()[order], power.ravel()[order]
+        energy = seen.ravel()[order]
+        power = power.ravel()[order]
         mean_power = np.add.reduceat(power, starts) / counts
         mean = np.add.reduceat(energy, starts) / counts
         speckle = power - np.repeat(mean_power, counts)
@@ -220,7 +225,8 @@ class PsfConsistency:
 
     def _deconvolved_amplitude(self, spectrum: Spectrum, otf: Spectrum) -> Spectrum:
         """Return Y |H| / (|H|^2 + regularisation), a Wiener solution without the phase of H; prior power ~ 1/f."""
-        power, seen = _power(otf), _power(spectrum)
+        power = _power(otf)
+        seen = _power(spectrum)
         low, high = band(self._frequency, power, max(self._grid.window))
         part = (self._frequency > low) & (self._frequency < high)
         noise = self._noise(seen, power)
@@ -280,13 +286,15 @@ def filled(y: Image, good: Image) -> Image:
     there = (good > 0.5).astype(np.float32)
     if there.all() or not there.any():
         return y
-    image, known = np.where(there > 0, y, np.float32(0)), there
+    image = np.where(there > 0, y, np.float32(0))
+    known = there
     width = 2.0
     while not known.all():
         weight = ndimage.gaussian_filter(known, width)
         near = ndimage.gaussian_filter(image * known, width) / np.maximum(weight, 1e-6)
         found = (known == 0) & (weight > 0.05)
-        image, known = np.where(found, near, image), np.where(found, np.float32(1), known)
+        image = np.where(found, near, image)
+        known = np.where(found, np.float32(1), known)
         width *= 2
     return np.asarray(image, np.float32)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon.assessment.field_edge import FieldEdgeFit
-from device.recon.estimation.refraction.estimator import LEAST_FREQUENCIES, RefractionEstimator, Search
+from device.recon.estimation.refraction.estimator import MIN_FREQUENCIES, RefractionEstimator, Search
 from device.recon.estimation.refraction.likelihood import noise_power
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Linear
@@ -59,7 +59,8 @@ class PsfMatchTest:
     """
 
     def __init__(self, refractor: RefractionEstimator, has_edge: bool = True) -> None:
-        self._refractor, self._likelihood = refractor, refractor.likelihood
+        self._refractor = refractor
+        self._likelihood = refractor.likelihood
         bands = self._likelihood.bands
         band = bands.whole
         order = np.argsort(np.hypot(band.rows, band.cols))
@@ -73,8 +74,9 @@ class PsfMatchTest:
 
         `between` is called every few milliseconds; its exceptions end the test.
         """
-        refractor, likelihood = self._refractor, self._likelihood
-        if likelihood.bands.whole.where.size < LEAST_FREQUENCIES:
+        refractor = self._refractor
+        likelihood = self._likelihood
+        if likelihood.bands.whole.where.size < MIN_FREQUENCIES:
             return None
         frame = likelihood.frame(counts, dark, refractor.defects(counts, dark))
         if not likelihood.fit_smooth(frame, likelihood.model.stored) > 0:
@@ -93,7 +95,8 @@ class PsfMatchTest:
         if self._rim is None:
             return PsfMatchResult(score, sd, sphere_dpt, None, None)
         likelihood.model.refocus(likelihood.otf(likelihood.grid, sphere_dpt))
-        edge, per_deg = self._rim.fit(frame.y, between), refractor.geometry.px_per_deg / likelihood.grid.n
+        edge = self._rim.fit(frame.y, between)
+        per_deg = refractor.geometry.px_per_deg / likelihood.grid.n
         return PsfMatchResult(
             score,
             sd,
@@ -103,13 +106,15 @@ class PsfMatchTest:
         )
 
     def _score(self, y: Image, noise: float) -> tuple[float, float]:
-        band, fft = self._likelihood.bands.whole, self._likelihood.fft
+        band = self._likelihood.bands.whole
+        fft = self._likelihood.fft
         np.multiply(y, self._likelihood.taper, out=fft.space)
         seen = np.abs(fft.forward().ravel()[band.where].astype(np.complex128)) ** 2
         power = band.power.astype(np.float64)
         found = expected = certainty = 0.0
         for ring in self._rings:
-            energy, speckle = seen[ring], power[ring] - power[ring].mean()
+            energy = seen[ring]
+            speckle = power[ring] - power[ring].mean()
             mean = float(energy.mean())
             level = max(mean - noise, 0.0) / float(power[ring].mean())
             spread = float(speckle @ speckle) / mean**2

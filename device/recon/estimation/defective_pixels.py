@@ -8,7 +8,7 @@ the noise is not an image of light: it is a defect.
   SATURATED_REACH_PX);
 * values below the black level by more than the noise and LOW_SHARE of that level;
 * single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
-  deviations plus `ring_ranges` of the PSF times the ring's range; none above MOST_OUTLIERS;
+  deviations plus `ring_ranges` of the PSF times the ring's range; none above MAX_OUTLIERS;
 * gaps without light (dead columns, rows, areas) with a sharp border (NARROW_PX, SHADOW, EDGE, EDGE_SHARE);
 * the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_SD).
 
@@ -40,27 +40,27 @@ SATURATED_REACH_PX = 3
 CLIPPED_SD = 2.0  # of the noise below the white level, where the converter clips one value in forty
 CLIPPED_SHARE = 0.1  # of the white level, at the most: a well of 400 electrons has noise of 0.05
 AREA_NEIGHBOURS = 4  # of 8: saturated pixels with as many saturated neighbours are an area, not hot pixels
-MOST_OUTLIERS = 0.05  # share of pixels of one kind; more are structure of the frame, and none is marked
+MAX_OUTLIERS = 0.05  # share of pixels of one kind; more are structure of the frame, and none is marked
 NARROW_PX = 25  # dead columns and rows up to this width are found by comparison with their surroundings
 LIT = 4.0  # in units of the largest value without light: the least light beside an edge
 SHADOW = 0.1  # of the light around it: a narrow gap is darker
 EDGE = 0.3  # of the light around it: the step at the border of a gap is larger
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
-LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
+MIN_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
 HALO = 0.01  # of the light of the fitted field: more is a reflex. Overexposed eyes have at most 0.003
 HALO_BEGINS = 0.05  # of it in the first ring; an eye of 8 dpt with the stored PSF has up to 0.04
 HALO_SD = 3.0  # standard errors of a ring's mean excess
 HALO_MARGIN = 3  # samples beyond the last ring with an excess
 HALO_TURNS = 5  # the halo biases the first fit of the field
 HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
-LEAST_AREA = 2  # samples of a saturated area that may have a halo
+MIN_AREA = 2  # samples of a saturated area that may have a halo
 RANGE_SHARE = 0.999  # of the PSF's pixels; a frame is a mean of many PSFs, in which no single pixel of one stands out
 PSF_NOISE_SD = 1.0  # subtracted from the PSF's ring excess; the measured noise includes the PSF's own fine lines
 # Excess of a hot pixel of a PSF over its rings, in their ranges: recorded PSFs have up to 8 and 25, hot pixels hundreds
 HOT_RANGES = (10.0, 30.0)
 HOT_SHARE = 0.05  # of the PSF's brightest light (its quantile RANGE_SHARE): a dimmer excess does no harm
 CORE_SHARE = 0.02  # of the light: a pixel with more is the focus of a sharp PSF, and not hot
-MOST_HOT_LIGHT = 0.5  # share of the light: candidates with more are the points of a sharp PSF
+MAX_HOT_LIGHT = 0.5  # share of the light: candidates with more are the points of a sharp PSF
 LOW_SHARE = 0.5  # of the black level: the lowest value of a working pixel is so far below it, plus the noise limit
 BLACK_PER_LIMIT = 4  # least black level over the noise limit; with a lower one, values below black are not tested
 FEW = 200  # candidates; with fewer the calibrated noise is kept
@@ -96,10 +96,12 @@ class PixelNoise:
         if min(rows, cols) < 3:
             return cls(0.0, float("inf"))
         places = np.arange(0, (rows - 2) * (cols - 2), max(1, (rows - 2) * (cols - 2) // SAMPLES) | 1)
-        mean, off = np.empty(places.size, np.float32), np.empty(places.size, np.float32)
+        mean = np.empty(places.size, np.float32)
+        off = np.empty(places.size, np.float32)
         kernels.neighbours(counts, dark, places, mean, off)
         known = np.isfinite(off) & (counts[1 + places // (cols - 2), 1 + places % (cols - 2)] < white_dn)
-        mean, off = mean[known].astype(np.float64), off[known].astype(np.float64)
+        mean = mean[known].astype(np.float64)
+        off = off[known].astype(np.float64)
         order = np.argsort(mean)
         groups = [group for group in np.array_split(order, LEVELS) if group.size]
         level = np.array([max(float(np.median(mean[group])), 0.0) for group in groups])
@@ -138,14 +140,16 @@ class DefectFinder:
         if calibration.dark_dn is not None and calibration.dark_dn.shape == shape:
             self._dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
         self._dark = read_only(self._dark)
-        gain, read_e = sensor.gain_e_per_dn, sensor.read_noise_e or 0.0
+        gain = sensor.gain_e_per_dn
+        read_e = sensor.read_noise_e or 0.0
         self._least_noise = (
             PixelNoise(0.0, 0.0) if gain is None else PixelNoise(1 / gain, (read_e / gain) ** 2 + QUANTISATION_DN2)
         )
         self._bad: Mask = np.zeros(shape, np.bool_)
         if calibration.bad is not None and calibration.bad.shape == shape:
             self._bad = calibration.bad
-        self._ranges, self._steepest = ring_ranges(calibration.psfs[index]), steepest(calibration.psfs[index])
+        self._ranges = ring_ranges(calibration.psfs[index])
+        self._steepest = steepest(calibration.psfs[index])
         self._calibration, self._shape, self._index = calibration, shape, index
         self._known: Mask = self._bad.copy()
         self._suspect: Mask = np.zeros(shape, np.bool_)
@@ -159,7 +163,8 @@ class DefectFinder:
         """
         counts = require_shape("frame", counts, self._shape)
         offset = self._dark if dark is None else require_shape("dark frame", np.asarray(dark, np.float32), self._shape)
-        noise, found = self._least_noise, FEW + 1
+        noise = self._least_noise
+        found = FEW + 1
         if noise.floor_dn2 > 0:
             found = self._mark_suspects(counts, offset, noise)
         if found > FEW:  # the gain is not known, or the frame is noisier, or there are many defects
@@ -173,10 +178,10 @@ class DefectFinder:
         dark_dn = NOISE_SD * noise.floor_dn2**0.5
         saturated = counts.ravel()[places] >= self._white_dn
         low = (
-            (light < least_dn) if np.count_nonzero(light < least_dn) <= MOST_OUTLIERS * counts.size else light < -np.inf
+            (light < least_dn) if np.count_nonzero(light < least_dn) <= MAX_OUTLIERS * counts.size else light < -np.inf
         )
         outlying = self._outliers(counts, offset, noise, places[~saturated & ~low])
-        gap = np.count_nonzero(light <= dark_dn) >= LEAST_EDGE_PX
+        gap = np.count_nonzero(light <= dark_dn) >= MIN_EDGE_PX
         if not (saturated.any() or low.any() or gap):
             return outlying if outlying.size else None
         defective = np.zeros(counts.shape, np.bool_)
@@ -229,16 +234,18 @@ class DefectFinder:
         return -(LOW_SHARE * black_dn + margin_dn) if black_dn > BLACK_PER_LIMIT * margin_dn else -3e38
 
     def _outliers(self, counts: Pixels, offset: Image, noise: PixelNoise, places: Places) -> Places:
-        """Return the outliers among `places` (flat indices); none if they exceed MOST_OUTLIERS of the pixels."""
+        """Return the outliers among `places` (flat indices); none if they exceed MAX_OUTLIERS of the pixels."""
         limit = NOISE_SD**2
-        slope_dn, floor_dn2 = limit * noise.per_dn, limit * noise.floor_dn2
-        is_outlier, known = np.zeros(places.size, np.bool_), self._known.ravel()
+        slope_dn = limit * noise.per_dn
+        floor_dn2 = limit * noise.floor_dn2
+        is_outlier = np.zeros(places.size, np.bool_)
+        known = self._known.ravel()
         for _ in range(PASSES):
             if not kernels.outliers(counts, offset, self._known, places, slope_dn, floor_dn2, self._ranges, is_outlier):
                 break
             known[places[is_outlier]] = True
         known[places] = self._bad.ravel()[places]
-        return places[is_outlier] if np.count_nonzero(is_outlier) <= MOST_OUTLIERS * counts.size else places[:0]
+        return places[is_outlier] if np.count_nonzero(is_outlier) <= MAX_OUTLIERS * counts.size else places[:0]
 
     def _gaps(self, light: Image, dark_dn: float) -> Mask:
         """Return the areas without light (rows, cols) whose border is sharper than the PSF permits.
@@ -264,7 +271,9 @@ def steep(image: Image, share: float, least: Image) -> Mask:
     """
     out = np.zeros(image.shape, np.bool_)
     for axis in (0, 1):
-        line, limit, marks = np.moveaxis(image, axis, 0), np.moveaxis(least, axis, 0), np.moveaxis(out, axis, 0)
+        line = np.moveaxis(image, axis, 0)
+        limit = np.moveaxis(least, axis, 0)
+        marks = np.moveaxis(out, axis, 0)
         if len(line) < 4:
             continue
         i, j, shares = _large_steps(line, np.maximum(limit[1:-2], limit[2:-1]))
@@ -324,9 +333,10 @@ class HaloFinder:
         lost = frame.good < 0.5
         labels, count = ndimage.label(lost)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)
-        areas = [k for k in range(1, count + 1) if sizes[k] >= LEAST_AREA]
+        areas = [k for k in range(1, count + 1) if sizes[k] >= MIN_AREA]
         distance, nearest = ndimage.distance_transform_edt(~lost, return_indices=True)
-        owner, ring = labels[tuple(nearest)], np.ceil(distance).astype(np.int64)
+        owner = labels[tuple(nearest)]
+        ring = np.ceil(distance).astype(np.int64)
         reach = np.zeros(count + 1, np.int64)
         good = frame.good.copy()
         for _ in range(HALO_TURNS):
@@ -403,7 +413,8 @@ def ring_ranges(psf: Psf) -> tuple[float, float]:
         return float("inf"), float("inf")
     zero_row = read_only(np.zeros((1, pixels.shape[1]), np.float32))
     noise = PixelNoise.measured(pixels, zero_row)
-    least, limit = float(np.float32(0.1) * pixels.max()), PSF_NOISE_SD**2  # a float32: the count must be the kernel's
+    least = float(np.float32(0.1) * pixels.max())  # a float32: the count must be the kernel's
+    limit = PSF_NOISE_SD**2
     no_mask = np.zeros(pixels.shape, np.bool_)
     excess = np.zeros((np.count_nonzero(pixels[2:-2, 2:-2] >= least), 2))
     kernels.ring_excess(pixels, zero_row, no_mask, least, limit * noise.per_dn, limit * noise.floor_dn2, excess)
@@ -436,10 +447,12 @@ def _hot_pixels(pixels: Image) -> Places:
     places = np.flatnonzero((pixels > beside + np.float32(least)) & (pixels < CORE_SHARE))
     if not places.size:
         return none
-    zero_row, known = read_only(np.zeros((1, pixels.shape[1]), np.float32)), np.zeros(pixels.shape, np.bool_)
+    zero_row = read_only(np.zeros((1, pixels.shape[1]), np.float32))
+    known = np.zeros(pixels.shape, np.bool_)
     noise = PixelNoise.measured(pixels, zero_row)
-    is_hot, limit = np.zeros(places.size, np.bool_), NOISE_SD**2
+    is_hot = np.zeros(places.size, np.bool_)
+    limit = NOISE_SD**2
     kernels.outliers(pixels, zero_row, known, places, limit * noise.per_dn, limit * noise.floor_dn2, HOT_RANGES, is_hot)
     found = places[is_hot]
-    are_points = float(pixels.ravel()[found].sum(dtype=np.float64)) > MOST_HOT_LIGHT
-    return none if are_points or found.size > MOST_OUTLIERS * pixels.size else found
+    are_points = float(pixels.ravel()[found].sum(dtype=np.float64)) > MAX_HOT_LIGHT
+    return none if are_points or found.size > MAX_OUTLIERS * pixels.size else found

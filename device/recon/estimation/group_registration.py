@@ -13,10 +13,10 @@ import numpy as np
 from device.recon.estimation.registration import Detail, Registrar, Registration, Shift
 from device.values import Image
 
-LEAST_SD = 6.0  # a match by chance: the highest of 10,000 independent values lies at about 4 sd
-LEAST_OF_TYPICAL = 0.75  # of the better half's median correlation; a frame half covered by the lid reaches 0.5 of it
-LEAST_SHARPNESS = 0.965  # of the expected correlation: 0.98 or more with 8 pixels of motion blur, 0.9 to 0.96 with 15
-LEAST_SCATTER = 5.0  # standard deviations of the frames' correlations below their median
+MIN_SD = 6.0  # a match by chance: the highest of 10,000 independent values lies at about 4 sd
+MIN_OF_TYPICAL = 0.75  # of the better half's median correlation; a frame half covered by the lid reaches 0.5 of it
+MIN_SHARPNESS = 0.965  # of the expected correlation: 0.98 or more with 8 pixels of motion blur, 0.9 to 0.96 with 15
+MIN_SCATTER = 5.0  # standard deviations of the frames' correlations below their median
 FEWEST = 3  # frames that show which one is blurred
 
 
@@ -64,7 +64,8 @@ def _blurred(found: Mapping[int, Registration], light: Mapping[int, float]) -> d
     if len(found) < FEWEST:
         return {}
     values = np.clip([one.correlation for one in found.values()], 0.0, 0.999)
-    typical, usual = float(np.median(values)), float(np.median([light[k] for k in found]))
+    typical = float(np.median(values))
+    usual = float(np.median([light[k] for k in found]))
     by_chance = float(np.median([one.sd for one in found.values()])) * (1 - typical**2)
     scatter = max(1.4826 * float(np.median(np.abs(values - typical))), by_chance)  # 1.4826: of a normal distribution
     signal = typical**2 / (1 - typical**2)  # over the noise of the median frame
@@ -72,7 +73,7 @@ def _blurred(found: Mapping[int, Registration], light: Mapping[int, float]) -> d
     for k, one in found.items():
         power = signal * min(light[k] / usual, 1.0)
         expected = float(np.sqrt(power / (1 + power)))
-        least = min(LEAST_SHARPNESS * expected, expected - LEAST_SCATTER * scatter)
+        least = min(MIN_SHARPNESS * expected, expected - MIN_SCATTER * scatter)
         if one.correlation < least:
             reasons[k] = f"is blurred by motion (correlation {one.correlation:.2f}, at least {least:.2f})"
     return reasons if len(found) - len(reasons) >= 2 else {}
@@ -93,7 +94,7 @@ def _least_correlation(found: Sequence[Registration]) -> float:
         return 0.0
     sd = float(np.median([one.sd for one in found]))
     better = sorted(one.correlation for one in found)[len(found) // 2 :]
-    return max(LEAST_SD * sd, LEAST_OF_TYPICAL * float(np.median(better)) - 2 * sd)
+    return max(MIN_SD * sd, MIN_OF_TYPICAL * float(np.median(better)) - 2 * sd)
 
 
 def _refined(registrar: Registrar, flats: Mapping[int, Image], shifts: Mapping[int, Shift]) -> dict[int, Registration]:

@@ -15,14 +15,14 @@ from device.recon.model.field_projection import FieldProjection, Motion, Plane
 from device.values import Image
 
 FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of the smoothing against noise
-MOST_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
-LEAST_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
+MAX_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
+MIN_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
 SECOND_SAMPLES = 8  # distance from the peak at which another one begins
 OUTER_SHARE = 0.2  # of the radius of the common part: a match without shift must hold without it
 SECOND_OVERLAP = 0.2  # of another place, as much as a picture needs to be placed
 ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search: at most 1 degree off (NUMERICS.md 11)
 REFINEMENTS = 8  # of shift and rotation; they converge in three or four
-MOST_STEP_DEG = 1.7  # of one of them
+MAX_STEP_DEG = 1.7  # of one of them
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def flatten(picture: Image, field: Image) -> FlatPicture:
     local = ndimage.gaussian_filter(picture * inside, FLATTEN_SAMPLES) / weight
     level = float((picture * inside).sum() / max(inside.sum(), 1))
     detail = (picture / np.maximum(local, max(0.05 * level, 1e-30)) - 1) * inside
-    detail = np.clip(ndimage.gaussian_filter(detail, SHARPEN_SAMPLES) * inside, -MOST_CONTRAST, MOST_CONTRAST)
+    detail = np.clip(ndimage.gaussian_filter(detail, SHARPEN_SAMPLES) * inside, -MAX_CONTRAST, MAX_CONTRAST)
     return FlatPicture(np.asarray(detail, np.float32), inside)
 
 
@@ -116,12 +116,14 @@ class MaskedCorrelator:
 
     def _of(self, picture: FlatPicture) -> tuple[NDArray[np.complex128], ...]:
         """Return the spectra of detail, field and squared detail."""
-        detail, field = picture.detail.astype(np.float64), picture.field.astype(np.float64)
+        detail = picture.detail.astype(np.float64)
+        field = picture.field.astype(np.float64)
         return tuple(fft.rfft2(one, self._shape) for one in (detail, field, detail * detail))
 
     def _surface(self, moved: tuple[NDArray[np.complex128], ...], area: float) -> tuple[Floats, Floats]:
         """Return correlation (-1 where the overlap is too small) and overlap for every shift, cyclic."""
-        (a, field_a, a2), (b, field_b, b2) = self._spectra, moved
+        (a, field_a, a2) = self._spectra
+        (b, field_b, b2) = moved
 
         def correlate(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> Floats:
             return np.asarray(fft.irfft2(np.conj(one) * other, self._shape))
@@ -129,12 +131,13 @@ class MaskedCorrelator:
         count = correlate(field_a, field_b)
         share = count / max(min(self._area, area), 1.0)
         count = np.maximum(count, 1.0)
-        sum_a, sum_b = correlate(a, field_b), correlate(field_a, b)
+        sum_a = correlate(a, field_b)
+        sum_b = correlate(field_a, b)
         covariance = correlate(a, b) - sum_a * sum_b / count
         variance_a = correlate(a2, field_b) - sum_a**2 / count
         variance_b = correlate(field_a, b2) - sum_b**2 / count
         scale = np.sqrt(np.maximum(variance_a, 1e-12) * np.maximum(variance_b, 1e-12))
-        return np.where(share > LEAST_OVERLAP, covariance / scale, -1.0), share
+        return np.where(share > MIN_OVERLAP, covariance / scale, -1.0), share
 
     def _top(self, surface: Floats, place: tuple[int, int], axis: int) -> float:
         """Return the shift along an axis at the top of the parabola through the peak and its neighbours."""
@@ -164,14 +167,16 @@ def refined(
     places = np.moveaxis(np.indices(reference.field.shape, dtype=np.float64), 0, -1) - middle
     rates = _rates(projection, places)
     coefficients = ndimage.spline_filter(picture.detail, order=3, output=np.float32)
-    motion, best = Motion(start.shift, start.rotation_deg), start
+    motion = Motion(start.shift, start.rotation_deg)
+    best = start
     for _ in range(REFINEMENTS):
         at = np.moveaxis(projection.moved(places, motion) + middle, -1, 0)
         both = (reference.field > 0) & (ndimage.map_coordinates(picture.field, at, order=1) > 0.99)
-        if both.sum() < LEAST_OVERLAP * reference.field.sum():
+        if both.sum() < MIN_OVERLAP * reference.field.sum():
             return best
         moved: Image = ndimage.map_coordinates(coefficients, at, order=3, prefilter=False)
-        down, right = np.asarray(np.gradient(moved, axis=0)), np.asarray(np.gradient(moved, axis=1))
+        down = np.asarray(np.gradient(moved, axis=0))
+        right = np.asarray(np.gradient(moved, axis=1))
         a, b = (_normalised(one[both]) for one in (reference.detail, moved))
         correlation = float(a @ b)
         if correlation > best.peak or best is start:
@@ -180,7 +185,7 @@ def refined(
         slopes = np.stack([(down * rate[..., 0] + right * rate[..., 1])[both] for rate in rates], axis=1) / scale
         step = np.linalg.lstsq(slopes - slopes.mean(axis=0), a - b, rcond=None)[0]
         first, second = np.clip(step[:2], -2, 2)
-        small = Motion((float(first), float(second)), float(np.clip(step[2], -MOST_STEP_DEG, MOST_STEP_DEG)))
+        small = Motion((float(first), float(second)), float(np.clip(step[2], -MAX_STEP_DEG, MAX_STEP_DEG)))
         motion = projection.composed(small, motion)
     return best
 

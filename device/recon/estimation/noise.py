@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from device.values import Sensor
 
 DITHERING_SD = 0.5  # counts
-LEAST_DN2 = 1e-20  # lower limit against a division by 0 for a black frame; float frames may be tiny
+MIN_DN2 = 1e-20  # lower limit against a division by 0 for a black frame; float frames may be tiny
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class Noise:
         Rounding shifts the mean of counts with a noise of sd s by up to exp(-2 pi^2 s^2) / pi (Widrow and Kollar 2008):
         by 0.002 counts where s is DITHERING_SD, and to 0 a light of a tenth of a count where s is small.
         """
-        pixel, rest_dn2 = n * n, max(self.floor_dn2 * n * n - 1 / 12, 0.0)
+        pixel = n * n
+        rest_dn2 = max(self.floor_dn2 * n * n - 1 / 12, 0.0)
         return max(DITHERING_SD**2 - rest_dn2, 0.0) / (self.per_dn * pixel) if self.per_dn > 0 else 0.0
 
     @classmethod
@@ -41,4 +42,4 @@ class Noise:
             read_dn = (sensor.read_noise_e or 0.0) / sensor.gain_e_per_dn
             return cls(1 / sensor.gain_e_per_dn / pixels, (read_dn**2 + 1 / 12) / pixels)
         shot = 0.8 * measured_dn2 if mean_dn > 0 else 0.0
-        return cls(shot / mean_dn if mean_dn > 0 else 0.0, max(measured_dn2 - shot, LEAST_DN2))
+        return cls(shot / mean_dn if mean_dn > 0 else 0.0, max(measured_dn2 - shot, MIN_DN2))

@@ -79,7 +79,8 @@ class PowerLawPrior:
         levels = np.empty(BINS)
         fused_kernels.ring_levels(seen, self.power, self.bins, noise_dn2, TURNS, levels)
         sound = levels > 1e-4 * levels.max()
-        slope, log_power = -2.0, float(np.log(max(levels.max(), 1e-300)))
+        slope = -2.0
+        log_power = float(np.log(max(levels.max(), 1e-300)))
         if sound.sum() > 2:
             slope, log_power = np.polyfit(self.middles[sound], np.log(levels[sound]), 1)
         law = fused_kernels.most_likely_power_law(seen, self.power, self.logs, noise_dn2, log_power, -slope, STEPS)

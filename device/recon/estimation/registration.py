@@ -17,7 +17,7 @@ from device.values import Image
 BAND_PER_PX = (0.004, 0.12)  # cycles per sensor pixel: vessels and background texture, without shading and noise
 FLATTEN_PX = 25.0  # sigma of the local mean, in sensor pixels
 RIM_PX, WINDOW_PX = 14.0, 40.0  # the window is 0 within RIM_PX of the field's edge and rises over WINDOW_PX
-LEAST_LEVEL = 0.05  # of the mean level: below it a picture has no detail to divide by
+MIN_LEVEL = 0.05  # of the mean level: below it a picture has no detail to divide by
 REACH = 0.5  # largest shift as a share of the shorter side of the picture
 STEPS_SAMPLES = (0.25, 0.05, 0.01)  # of the search around the peak
 
@@ -56,7 +56,8 @@ class Registrar:
     def __init__(
         self, field: Image, n: int, flatten_px: float = FLATTEN_PX, band_per_px: tuple[float, float] = BAND_PER_PX
     ) -> None:
-        self._n, self._sigma = n, flatten_px / n
+        self._n = n
+        self._sigma = flatten_px / n
         padded = np.pad(field, 1)  # the picture ends at its border, where an unknown field has no edge
         depth = np.asarray(ndimage.distance_transform_edt(padded > 0.5), np.float32)[1:-1, 1:-1] * n
         rise = np.clip((depth - RIM_PX) / WINDOW_PX, 0, 1)
@@ -64,12 +65,14 @@ class Registrar:
         self._inside = (depth > RIM_PX / 2).astype(np.float32)
         self._weight = np.maximum(ndimage.gaussian_filter(self._inside, self._sigma), 0.05)
         self._shape = tuple(fft.next_fast_len(round((1 + REACH) * size), real=True) for size in field.shape)
-        rows, cols = np.fft.fftfreq(self._shape[0]), np.fft.rfftfreq(self._shape[1])
+        rows = np.fft.fftfreq(self._shape[0])
+        cols = np.fft.rfftfreq(self._shape[1])
         radius = np.hypot(rows[:, None], cols[None]) / n
         band = (radius > band_per_px[0]) & (radius < band_per_px[1])
         self._band = band.astype(np.float32)
         self._box = np.ix_(band.any(axis=1), band.any(axis=0))  # outside it every detail is 0
-        self._rows, self._cols = rows[band.any(axis=1)], cols[band.any(axis=0)]
+        self._rows = rows[band.any(axis=1)]
+        self._cols = cols[band.any(axis=0)]
 
     def flat(self, picture: Image) -> Image:
         """Return a linear picture (rows, cols) divided by its local mean, minus 1; 0 outside the field."""
@@ -78,7 +81,7 @@ class Registrar:
         if not level > 0:
             return np.zeros_like(lit)
         local = ndimage.gaussian_filter(lit, self._sigma) / self._weight
-        return np.asarray((lit / np.maximum(local, LEAST_LEVEL * level) - 1) * self._inside, np.float32)
+        return np.asarray((lit / np.maximum(local, MIN_LEVEL * level) - 1) * self._inside, np.float32)
 
     def detail(self, flat: Image, shift_px: Shift = (0.0, 0.0)) -> Detail:
         """Return the detail of a flat picture, moved back by `shift_px` and windowed to what both fields hold."""
@@ -108,7 +111,8 @@ class Registrar:
         reach = [int(REACH * min(self._shape) / (1 + REACH))] * 2
         around = np.roll(surface, reach, axis=(0, 1))[: 2 * reach[0] + 1, : 2 * reach[1] + 1]
         row, col = np.unravel_index(int(around.argmax()), around.shape)
-        best, peak = (float(row - reach[0]), float(col - reach[1])), float(around.max())
+        best = (float(row - reach[0]), float(col - reach[1]))
+        peak = float(around.max())
         inside = np.ascontiguousarray(cross[self._box])
         for step in STEPS_SAMPLES:
             best, peak = self._refined(inside, best, step)

@@ -14,7 +14,7 @@ from scipy import fft as scipy_fft
 
 from device.recon.model.forward_model import Model
 from device.recon.model.kernels import Box
-from device.recon.model.preprocessing import LEAST_GOOD, Linear
+from device.recon.model.preprocessing import MIN_GOOD, Linear
 from device.values import Image
 
 DEGREE = 8
@@ -36,7 +36,8 @@ class Shading:
         count = (DEGREE + 1) * (DEGREE + 2) // 2 if known else 1
         top, bottom, left, right = self.box
         self._modes = np.empty((count, (bottom - top) * (right - left)), np.float32)
-        on_blocks, seen = [], []
+        on_blocks = []
+        seen = []
         for row, mode in zip(self._modes, modes(model) if known else [model.mask], strict=True):
             row[:] = mode[top:bottom, left:right].ravel()
             on_blocks.append(self._torus_of_blocks(mode))
@@ -63,7 +64,8 @@ class Shading:
         OTF. `refocus` adds `_beyond_blocks`, the part of the edge, which is computed once on all samples: it changes
         little with the PSF.
         """
-        otf, n = self._model.otf, self._block
+        otf = self._model.otf
+        n = self._block
         rows, cols = (size // n for size in self._model.grid.shape)
         low = otf[np.fft.fftfreq(rows, 1 / rows).astype(int)][:, : cols // 2 + 1]
         high, wide = (size // n for size in self._model.grid.window)
@@ -78,7 +80,8 @@ class Shading:
 
     def _torus_of_blocks(self, mode: Image) -> Image:
         """Return the means over the blocks of the torus, counted from the window's corner."""
-        n, (top, left) = self._block, self._model.grid.at
+        n = self._block
+        (top, left) = self._model.grid.at
         rows, cols = (size // n for size in mode.shape)
         moved = np.roll(mode, (-top, -left), (0, 1))
         return _means(moved.reshape(rows, n, cols * n), n)
@@ -116,7 +119,7 @@ class Shading:
     def _fit_with_gaps(self, frame: Linear) -> NDArray[np.float64]:
         """Return the coefficients, stray light last, with each block weighted by its share of good pixels."""
         share = blocks(frame.good, self._block).ravel()
-        share[share < LEAST_GOOD] = 0
+        share[share < MIN_GOOD] = 0
         light = blocks(frame.y * frame.good, self._block).ravel()
         means = np.divide(light, share, out=np.zeros_like(light), where=share > 0)
         weighted = self._weighted * share
@@ -153,7 +156,8 @@ def zernike_modes(v: NDArray[np.floating], u: NDArray[np.floating]) -> Iterator[
     The constant mode is first; the order is n, then m, ascending (m < 0: sine). Beyond the unit disc each continues
     with its value at the edge.
     """
-    radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
+    radius = np.minimum(np.hypot(u, v), 1)
+    angle = np.arctan2(v, u)
     powers = [np.ones_like(radius)]
     for _ in range(DEGREE):
         powers.append(powers[-1] * radius)

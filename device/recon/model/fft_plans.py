@@ -75,7 +75,8 @@ class Planner:
         if threads < 1:
             raise SettingError(f"{threads} threads cannot plan anything")
         self.threads, self.effort, self.folder = threads, effort, folder
-        self.planned, self._lock = 0, Lock()
+        self.planned = 0
+        self._lock = Lock()
         if folder is not None:
             self._import_wisdom(self._file(folder))
 

@@ -111,5 +111,6 @@ class Sphere:
 
 def rotation_matrix(rotation_deg: float) -> Floats:
     """Return the matrix on (rows down, cols right) that turns counter-clockwise as displayed."""
-    c, s = np.cos(radians(rotation_deg)), np.sin(radians(rotation_deg))
+    c = np.cos(radians(rotation_deg))
+    s = np.sin(radians(rotation_deg))
     return np.array([[c, -s], [s, c]])

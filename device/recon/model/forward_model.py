@@ -70,7 +70,8 @@ def otf(psf: Psf, grid: Grid) -> Spectrum:
     kernel has no phase at a block's centre, so a binned picture is not shifted. A PSF larger than the grid loses its
     margin.
     """
-    n, (rows, cols) = grid.n, grid.shape
+    n = grid.n
+    (rows, cols) = grid.shape
     fine = scipy_fft.rfft2(wrapped(psf, (rows * n, cols * n)).astype(np.float64))
     down = np.fft.fftfreq(rows, 1 / rows).astype(int)
     low = fine[down][:, : cols // 2 + 1]
@@ -86,9 +87,11 @@ def dirichlet(frequency: np.ndarray, n: int) -> np.ndarray:
 def wrapped(psf: Psf, shape: Pair) -> Image:
     """Return the PSF on a torus of `shape` pixels with its centre at [0, 0]; a larger PSF loses its margin."""
     torus = np.zeros(shape, np.float32)
-    source, target = [], []
+    source = []
+    target = []
     for have, want in zip(psf.shape, shape, strict=True):
-        low, high = max(-(have // 2), -(want // 2)), min(have - have // 2, want - want // 2)
+        low = max(-(have // 2), -(want // 2))
+        high = min(have - have // 2, want - want // 2)
         source.append(slice(low + have // 2, high + have // 2))
         target.append(np.arange(low, high) % want)
     torus[np.ix_(*target)] = psf.pixels[tuple(source)]
@@ -114,7 +117,8 @@ def taper(shape: Pair, share: float = 0.15) -> Image:
 
 def _box(mask: Image) -> tuple[int, int, int, int]:
     """Return top, bottom, left, right of the nonzero part of the mask; bottom and right are exclusive."""
-    rows, cols = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
+    rows = np.nonzero(mask.any(axis=1))[0]
+    cols = np.nonzero(mask.any(axis=0))[0]
     return int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1
 
 

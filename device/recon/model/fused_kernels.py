@@ -18,9 +18,13 @@ def shrink(
     the updated multipliers, is the image part of the next x step. D is the periodic forward difference.
     """
     rows, cols = x.shape
-    t, zero, one, tiny = np.float32(threshold), np.float32(0), np.float32(1), np.float32(1e-30)
+    t = np.float32(threshold)
+    zero = np.float32(0)
+    one = np.float32(1)
+    tiny = np.float32(1e-30)
     for i in range(rows):
-        here, below = x[i], x[i + 1 if i + 1 < rows else 0]
+        here = x[i]
+        below = x[i + 1 if i + 1 < rows else 0]
         for j in range(cols):
             gx = (here[j + 1] if j + 1 < cols else here[0]) - here[j] + ux[i, j]
             gy = below[j] - here[j] + uy[i, j]
@@ -34,7 +38,9 @@ def shrink(
             uw[i, j] = v - w
             out[i, j] = w + w - v
         above = py[i - 1 if i > 0 else rows - 1]
-        row_x, row_y, row = px[i], py[i], out[i]
+        row_x = px[i]
+        row_y = py[i]
+        row = out[i]
         row[0] += row_x[cols - 1] - row_x[0]
         for j in range(1, cols):
             row[j] += row_x[j - 1] - row_x[j]
@@ -78,7 +84,10 @@ def data_weights(
     """Write W y to `weighted` and 1/(W + r) to `inverse`, on the grid; `blurred` is Hx, `stiffness` is r.
     W = good / (per_dn max(Hx, 0) + floor), the share of good pixels over the noise variance, in the window; else 0.
     """
-    p, f, r, zero = np.float32(per_dn), np.float32(floor), np.float32(stiffness), np.float32(0)
+    p = np.float32(per_dn)
+    f = np.float32(floor)
+    r = np.float32(stiffness)
+    zero = np.float32(0)
     weighted[:], inverse[:] = zero, np.float32(1) / r
     rows, cols = y.shape
     for i in range(rows):
@@ -107,10 +116,15 @@ def solve_x_step(
     `gradient_symbol`; r is `stiffness`.
     """
     rows, cols = data.shape
-    r, q, s, one = np.float32(stiffness), np.float32(rho), np.float32(scale), np.float32(1)
+    r = np.float32(stiffness)
+    q = np.float32(rho)
+    s = np.float32(scale)
+    one = np.float32(1)
     for i in range(rows):
         for j in range(cols):
-            h, d, m = otf[i, j], data[i, j], image[i, j]
+            h = otf[i, j]
+            d = data[i, j]
+            m = image[i, j]
             power = h.real * h.real + h.imag * h.imag
             weight = s / (r * power + q * (row_g[i] + col_g[j] + one))
             real = (r * (h.real * d.real + h.imag * d.imag) + q * m.real) * weight
@@ -126,7 +140,8 @@ def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> 
     s = np.float32(scale)
     for i in range(rows):
         for j in range(cols):
-            h, y = otf[i, j], spectrum[i, j]
+            h = otf[i, j]
+            y = spectrum[i, j]
             weight = s / (h.real * h.real + h.imag * h.imag + reg[i, j])
             spectrum[i, j] = complex(
                 (y.real * h.real + y.imag * h.imag) * weight, (y.imag * h.real - y.real * h.imag) * weight
@@ -140,7 +155,8 @@ def ring_levels(
     """Write the estimated g of each ring in seen = power g + noise_dn2 to `levels`; at least 1e-6 noise_dn2.
     Least squares, then `turns` reweighted repetitions. `seen` is |Y|^2, `power` |H|^2, `ring` the index of the ring.
     """
-    above, below = np.zeros(levels.size), np.zeros(levels.size)
+    above = np.zeros(levels.size)
+    below = np.zeros(levels.size)
     for turn in range(turns + 1):
         above[:], below[:] = 0, 0
         for k in range(seen.size):
@@ -183,7 +199,9 @@ def rms_residual(blurred: Image, y: Image, good: Image, per_dn: float, floor: fl
     """Return the rms of y - Hx in units of its noise, weighted by `good`: 1 for noise alone, 0 if all are missing.
     `blurred` is Hx on the grid, whose window begins at `at`; the noise variance is per_dn max(Hx, 0) + floor.
     """
-    p, f, zero = np.float32(per_dn), np.float32(floor), np.float32(0)
+    p = np.float32(per_dn)
+    f = np.float32(floor)
+    zero = np.float32(0)
     total = weight = np.float64(0)
     rows, cols = y.shape
     for i in range(rows):
@@ -207,12 +225,16 @@ def _read(table: Spectrum, row: float, col: float) -> complex:
     last = table.shape[1] - 1
     left = col < 0
     if left:
-        row, col = -row, -col
+        row = -row
+        col = -col
     row += last
     if not (0 <= row < 2 * last and col < last):
         return complex(np.float32(0), np.float32(0))
-    k, m = int(row), int(col)
-    t, u, one = np.float32(row - k), np.float32(col - m), np.float32(1)
+    k = int(row)
+    m = int(col)
+    t = np.float32(row - k)
+    u = np.float32(col - m)
+    one = np.float32(1)
     value = (one - t) * ((one - u) * table[k, m] + u * table[k, m + 1]) + t * (
         (one - u) * table[k + 1, m] + u * table[k + 1, m + 1]
     )
@@ -227,7 +249,9 @@ def stretched(
     multiplied by row_share col_share, the transfer of a sample along the two axes.
     """
     for i in range(rows.size):
-        across, down, share = matrix[0, 1] * rows[i], matrix[1, 1] * rows[i], row_share[i]
+        across = matrix[0, 1] * rows[i]
+        down = matrix[1, 1] * rows[i]
+        share = row_share[i]
         for j in range(cols.size):
             value = _read(table, matrix[1, 0] * cols[j] + down, matrix[0, 0] * cols[j] + across)
             out[i, j] = value * (share * col_share[j])
@@ -260,10 +284,13 @@ def negative_log_likelihood(
     `seen`, s2 is the noise. q = |H|^2 + smear (its mean over the ring), since a tapered window mixes frequencies.
     |seen|^2 is written to `energy`, q to `power`, g to `levels`; `turns` is the number of reweighted fits of g.
     """
-    above, below = np.zeros(levels.size), np.zeros(levels.size)
+    above = np.zeros(levels.size)
+    below = np.zeros(levels.size)
     cols = seen.shape[1]
     for m in range(where.size):
-        f, h, b = seen[where[m] // cols, where[m] % cols], otf[m], ring[m]
+        f = seen[where[m] // cols, where[m] % cols]
+        h = otf[m]
+        b = ring[m]
         energy[m] = f.real * f.real + f.imag * f.imag
         power[m] = h.real * h.real + h.imag * h.imag
         above[b] += power[m]
@@ -301,7 +328,8 @@ def multiply_conjugate(spectrum: Spectrum, otf: Spectrum) -> None:
     rows, cols = spectrum.shape
     for i in range(rows):
         for j in range(cols):
-            a, h = spectrum[i, j], otf[i, j]
+            a = spectrum[i, j]
+            h = otf[i, j]
             spectrum[i, j] = complex(a.real * h.real + a.imag * h.imag, a.imag * h.real - a.real * h.imag)
 
 
@@ -343,7 +371,8 @@ def step_along(
     Return the sum of weight * |rest|^2, as `squared_length` does.
     """
     rows, cols = x.shape
-    total, along = 0.0, np.float32(factor)
+    total = 0.0
+    along = np.float32(factor)
     for i in range(rows):
         for j in range(cols):
             x[i, j] += along * direction[i, j]

@@ -49,9 +49,11 @@ class Grid:
         With a known field, sensor pixels beyond the blurred field are left out. Without one, the object extends as far
         as light can reach the sensor.
         """
-        shape, window = [], []
+        shape = []
+        window = []
         for size in sensor:
-            half, psf = size // n / 2, psf_radius_px / n
+            half = size // n / 2
+            psf = psf_radius_px / n
             object_samples = (field_radius_px + 3) / n if isfinite(field_radius_px) else half + psf
             blocks = 8 if isfinite(field_radius_px) else 2  # shading is fitted on blocks of 4 x 4
             samples = _fast(ceil(object_samples + psf + min(half, object_samples + psf)) + 2, blocks)
@@ -101,7 +103,8 @@ class Grid:
             return self.slices
         spans = []
         for middle, at, window in zip(self.centre, self.at, self.window, strict=True):
-            low, high = round(middle - self.radius_samples - 1), round(middle + self.radius_samples + 2)
+            low = round(middle - self.radius_samples - 1)
+            high = round(middle + self.radius_samples + 2)
             spans.append(slice(max(low, at, 0), max(min(high, at + window), max(low, at, 0) + 1)))
         return spans[0], spans[1]
 

@@ -42,15 +42,19 @@ def linearise(
     """
     rows, cols = out.shape
     wide = cols * n
-    total, used, offset = np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32)
+    total = np.empty(wide, np.float32)
+    used = np.empty(wide, np.float32)
+    offset = np.empty(wide, np.float32)
     saturated = good_pixels = light = np.float64(0)
     bend = np.float32(bend_per_dn)
     for i in range(rows):
         if n == 1:
-            total, used = out[i], good[i]
+            total = out[i]
+            used = good[i]
         total[:], used[:] = 0, 0
         for a in range(first[0] + i * n, first[0] + i * n + n):
-            begin, end = first[1], first[1] + wide
+            begin = first[1]
+            end = first[1] + wide
             if len(dark) > 1 or a == first[0]:  # a separate loop: inside the loop below it halves the speed
                 _copy(dark[a % len(dark)][begin:end], offset)
             gain_row = gain[a % len(gain)][begin:end]
@@ -72,7 +76,10 @@ def _copy(source: Pixels, target: Image) -> None:
 def _add_row(
     counts: Pixels, dark: Image, gain: Image, bend: Single, white_dn: Single, total: Image, used: Image
 ) -> Single:
-    zero, one, two, lowest = np.float32(0), np.float32(1), np.float32(2), np.float32(-3e38)
+    zero = np.float32(0)
+    one = np.float32(1)
+    two = np.float32(2)
+    lowest = np.float32(-3e38)
     saturated = zero
     for b in range(total.size):  # selects instead of branches: eight pixels to an instruction
         value = np.float32(counts[b])
@@ -87,7 +94,8 @@ def _add_row(
 
 @compiled
 def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tuple[Single, Single]:
-    zero, one = np.float32(0), np.float32(1)
+    zero = np.float32(0)
+    one = np.float32(1)
     good_pixels = light = zero
     if n == 1:  # `total` and `used` are `out` and `good` themselves
         for j in range(good.size):
@@ -125,13 +133,21 @@ def exclude_pixels(
     pixels outside the window, are skipped. `places` must not hold a pixel twice.
     """
     rows, cols = out.shape
-    bend, white, lowest = np.float32(bend_per_dn), np.float32(white_dn), np.float32(-3e38)
-    one, two, all_px = np.float32(1), np.float32(2), np.float32(n * n)
-    lost, light = 0, np.float64(0)
+    bend = np.float32(bend_per_dn)
+    white = np.float32(white_dn)
+    lowest = np.float32(-3e38)
+    one = np.float32(1)
+    two = np.float32(2)
+    all_px = np.float32(n * n)
+    lost = 0
+    light = np.float64(0)
     for place in places:
-        a, b = place // counts.shape[1], place % counts.shape[1]
-        i, j = (a - first[0]) // n, (b - first[1]) // n
-        value, weight = np.float32(counts[a, b]), gain[a % len(gain), b]
+        a = place // counts.shape[1]
+        b = place % counts.shape[1]
+        i = (a - first[0]) // n
+        j = (b - first[1]) // n
+        value = np.float32(counts[a, b])
+        weight = gain[a % len(gain), b]
         is_good = (value < white) & (value > lowest) & (weight > 0)
         if a < first[0] or b < first[1] or i >= rows or j >= cols or not is_good:
             continue
@@ -172,7 +188,8 @@ def flat_fit_sums(y: Image, flat: Image, good: Image) -> Sums:
 @compiled
 def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[int, int], out: Image) -> None:
     """Write (y - a flat - b) * good, the residual of the flat model, into `out` from sample `at` on."""
-    a32, b32 = np.float32(a), np.float32(b)
+    a32 = np.float32(a)
+    b32 = np.float32(b)
     rows, cols = y.shape
     for i in range(rows):
         for j in range(cols):
@@ -191,7 +208,10 @@ def wiener(
     `gradient` holds |D|^2 as a row part and a column part, to which MIN_GRADIENT_POWER is added.
     """
     rows, cols = spectrum.shape
-    slope32, floor32, term32, scale32 = np.float32(slope), np.float32(floor), np.float32(psf_term), np.float32(scale)
+    slope32 = np.float32(slope)
+    floor32 = np.float32(floor)
+    term32 = np.float32(psf_term)
+    scale32 = np.float32(scale)
     for i in range(rows):
         for j in range(cols):
             h = otf[i, j]
@@ -248,14 +268,18 @@ def interpolate_cubic(
     n = first.size
     rows, cols = image.shape
     top, bottom, left, right = box
-    begin, end = left + offset[1], right + offset[1]
-    low, high = max(begin // n - 2, 0), min((end - 1) // n + 3, cols)  # the columns used by the box
+    begin = left + offset[1]
+    end = right + offset[1]
+    low = max(begin // n - 2, 0)  # the columns used by the box
+    high = min((end - 1) // n + 3, cols)
     row_up = np.zeros(cols + 4, np.float32)  # one interpolated row with two repeated samples at each end
     for i in range(top, bottom):
         p = (i + offset[0]) % n
         k = (i + offset[0]) // n + first[p]
-        a, b = image[min(max(k, 0), rows - 1)], image[min(max(k + 1, 0), rows - 1)]
-        c, d = image[min(max(k + 2, 0), rows - 1)], image[min(max(k + 3, 0), rows - 1)]
+        a = image[min(max(k, 0), rows - 1)]
+        b = image[min(max(k + 1, 0), rows - 1)]
+        c = image[min(max(k + 2, 0), rows - 1)]
+        d = image[min(max(k + 3, 0), rows - 1)]
         wa, wb, wc, wd = weights[p]
         for j in range(low, high):
             row_up[j + 2] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
@@ -299,11 +323,16 @@ def add_moved(
     """
     rows, cols = image.shape
     down, across = taps
-    reach_down, reach_across = down.size // 2, across.size // 2
-    weight32, gain32 = np.float32(weight), np.float32(gain)
-    line, kept = np.empty(cols + 2 * reach_across, np.float32), np.empty(cols + 2 * reach_across, np.float32)
-    value, share = np.empty(cols, np.float32), np.empty(cols, np.float32)
-    low, high = max(0, -whole[1]), min(cols, cols - whole[1])
+    reach_down = down.size // 2
+    reach_across = across.size // 2
+    weight32 = np.float32(weight)
+    gain32 = np.float32(gain)
+    line = np.empty(cols + 2 * reach_across, np.float32)
+    kept = np.empty(cols + 2 * reach_across, np.float32)
+    value = np.empty(cols, np.float32)
+    share = np.empty(cols, np.float32)
+    low = max(0, -whole[1])
+    high = min(cols, cols - whole[1])
     for i in range(max(0, -whole[0]), min(rows, rows - whole[0])):
         line[:], kept[:] = 0, 1
         for t in range(down.size):
@@ -331,7 +360,9 @@ def _add_line(source: Image, good: Image, weight: Single, total: Image, kept: Im
 @compiled
 def finish_mean(total: Image, weights: Image, least: float, base: Image, scale: float) -> None:
     """Replace `total` by total / weights + scale base, and by NaN where `weights` is less than `least`."""
-    scale32, least32, missing = np.float32(scale), np.float32(least), np.float32(np.nan)
+    scale32 = np.float32(scale)
+    least32 = np.float32(least)
+    missing = np.float32(np.nan)
     rows, cols = total.shape
     for i in range(rows):
         for j in range(cols):
@@ -349,9 +380,11 @@ def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Im
     inner = counts.shape[1] - 2
     light = np.empty(5, np.float32)
     for k in range(places.size):
-        i, j = 1 + places[k] // inner, 1 + places[k] % inner
+        i = 1 + places[k] // inner
+        j = 1 + places[k] % inner
         for m in range(5):
-            a, b = i + (m == 1) - (m == 2), j + (m == 3) - (m == 4)
+            a = i + (m == 1) - (m == 2)
+            b = j + (m == 3) - (m == 4)
             light[m] = np.float32(counts[a, b]) - dark[a % len(dark), b]
         mean[k] = np.float32(0.25) * (light[1] + light[2] + light[3] + light[4])
         off[k] = light[0] - mean[k]
@@ -369,8 +402,13 @@ def mark_suspects(
     `least_dn` apply.
     """
     rows, cols = counts.shape
-    slope, floor, white, least = np.float32(slope_dn), np.float32(floor_dn2), np.float32(white_dn), np.float32(least_dn)
-    above, here, below = np.zeros(cols, np.float32), np.zeros(cols, np.float32), np.zeros(cols, np.float32)
+    slope = np.float32(slope_dn)
+    floor = np.float32(floor_dn2)
+    white = np.float32(white_dn)
+    least = np.float32(least_dn)
+    above = np.zeros(cols, np.float32)
+    here = np.zeros(cols, np.float32)
+    below = np.zeros(cols, np.float32)
     _light(counts[0], dark[0], here)
     _copy(here, above)
     total = 0
@@ -406,7 +444,8 @@ def _mark_row(
     least: Single,
     out: Mask,
 ) -> None:
-    quarter, zero = np.float32(0.25), np.float32(0)
+    quarter = np.float32(0.25)
+    zero = np.float32(0)
     last = out.size - 1
     for j in range(1, last):  # selects instead of branches, as in `_add_row`
         mean = quarter * (here[j - 1] + here[j + 1] + above[j] + below[j])
@@ -434,7 +473,8 @@ def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, ou
 def _sort(values: Image, n: int) -> None:
     """Sort the first `n` values in place, by insertion: np.sort takes a second to compile, and n is at most 16."""
     for m in range(1, n):
-        value, k = values[m], m
+        value = values[m]
+        k = m
         while k > 0 and values[k - 1] > value:
             values[k] = values[k - 1]
             k -= 1
@@ -462,7 +502,8 @@ def outliers(
     ring = np.empty(16, np.float32)
     found = 0
     for m in range(places.size):
-        i, j = places[m] // counts.shape[1], places[m] % counts.shape[1]
+        i = places[m] // counts.shape[1]
+        j = places[m] % counts.shape[1]
         if known[i, j]:
             continue
         light = np.float32(counts[i, j]) - dark[i % len(dark), j]
@@ -488,7 +529,8 @@ def ring_excess(
     `no_mask` a mask (rows, cols) of False.
     """
     rows, cols = image.shape
-    ring, at = np.empty(16, np.float32), 0
+    ring = np.empty(16, np.float32)
+    at = 0
     for i in range(2, rows - 2):
         for j in range(2, cols - 2):
             if image[i, j] < least:

@@ -11,8 +11,8 @@ from device.recon.model.grid import Grid
 from device.recon.model.kernels import Pixels, Places
 from device.values import Calibration, Image
 
-LEAST_GOOD = 0.5  # share of a sample's pixels that hold light; with fewer it is a gap
-MOST_BAD = 0.3  # share of pixels that may be missing (NUMERICS.md 6.1: at 30 % a masked fit still finds 0.89 of 0.95)
+MIN_GOOD = 0.5  # share of a sample's pixels that hold light; with fewer it is a gap
+MAX_BAD = 0.3  # share of pixels that may be missing (NUMERICS.md 6.1: at 30 % a masked fit still finds 0.89 of 0.95)
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,22 @@ class Linear:
     @property
     def has_gaps(self) -> bool:
         """True if a sample has lost more than half of its pixels; other samples use the mean of the remaining ones."""
-        return self.missing > 0 and bool(self.good.min() < LEAST_GOOD)
+        return self.missing > 0 and bool(self.good.min() < MIN_GOOD)
 
 
 class Preprocessor:
     """Preprocessing of the frames of one sensor, with the buffers of one grid's window.
 
     It holds dark level, nonlinearity, flat frame and bad pixels. With `output_buffer` (the window's shape, float32) the
-    linear frame is written to that buffer. FrameError if more than MOST_BAD of the pixels are marked bad, the sensor is
+    linear frame is written to that buffer. FrameError if more than MAX_BAD of the pixels are marked bad, the sensor is
     smaller than one sample, or a frame of the calibration has another shape than the sensor.
     """
 
     def __init__(self, calibration: Calibration, grid: Grid, output_buffer: Image | None = None) -> None:
-        self.grid, shape = grid, grid.sensor
-        self.white, self.bend_per_dn = calibration.sensor.white_dn, calibration.sensor.bend_per_dn
+        self.grid = grid
+        shape = grid.sensor
+        self.white = calibration.sensor.white_dn
+        self.bend_per_dn = calibration.sensor.bend_per_dn
         self.dark = np.full((1, shape[1]), calibration.sensor.black_dn, np.float32)  # one row for all rows
         self.gain = np.ones((1, shape[1]), np.float32)
         if calibration.dark_dn is not None:
@@ -63,7 +65,7 @@ class Preprocessor:
             self.gain[require_shape("bad-pixel mask", calibration.bad, shape)] = 0
         self.dark = read_only(self.dark)
         missing = float((self.gain == 0).mean())
-        if missing > MOST_BAD:
+        if missing > MAX_BAD:
             raise FrameError(
                 f"{missing:.0%} of the sensor's pixels are marked bad",
                 "Calibrate the head again; the sensor may be broken.",
@@ -78,12 +80,15 @@ class Preprocessor:
 
         `dark` is the dark frame of this shot; None: the calibration's. Saturated and bad pixels, NaN and `defects`
         (flat indices) count as missing. The next call overwrites the buffers of the result. FrameError for another
-        shape, or if more than MOST_BAD of the pixels are missing.
+        shape, or if more than MAX_BAD of the pixels are missing.
         """
         counts = require_shape("frame", counts, self.grid.sensor)
         offset = self.dark if dark is None else require_shape("dark frame", dark, self.grid.sensor)
-        y, good, grid = self._out.y, self._out.good, self.grid
-        first, n = grid.first_px, grid.n
+        y = self._out.y
+        good = self._out.good
+        grid = self.grid
+        first = grid.first_px
+        n = grid.n
         saturated, good_count, light_dn = kernels.linearise(
             counts, offset, self.bend_per_dn, self.gain, self.white, first, n, y, good
         )
@@ -91,9 +96,10 @@ class Preprocessor:
             lost_count, lost_dn = kernels.exclude_pixels(
                 counts, offset, self.bend_per_dn, self.gain, self.white, first, n, defects, y, good
             )
-            good_count, light_dn = good_count - lost_count, light_dn - lost_dn
+            good_count = good_count - lost_count
+            light_dn = light_dn - lost_dn
         mean_good = good_count / (good.size * n**2)
-        if mean_good < 1 - MOST_BAD:
+        if mean_good < 1 - MAX_BAD:
             raise FrameError(
                 f"{1 - mean_good:.0%} of the frame cannot be used (saturated, bad or not numbers)",
                 "Too bright. Move back a little, or lower the exposure; then take it again.",

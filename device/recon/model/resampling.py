@@ -7,7 +7,7 @@ from device.recon.model.grid import Grid
 from device.values import Image
 
 TAPS = 5  # of the windowed sinc, to either side
-LEAST_PART_PX = 0.005  # a smaller part of a pixel is not interpolated
+MIN_PART_PX = 0.005  # a smaller part of a pixel is not interpolated
 
 
 def cubic_weights(n: int) -> tuple[np.ndarray, Image]:
@@ -78,7 +78,8 @@ def block_mean(picture: Image, block: int) -> Image:
     if block < 2:
         return picture
     down, across = (min(block, length) for length in picture.shape[:2])  # a narrow picture may be thinner than a block
-    rows, cols = picture.shape[0] // down * down, picture.shape[1] // across * across
+    rows = picture.shape[0] // down * down
+    cols = picture.shape[1] // across * across
     strips = sum((picture[row:rows:down] for row in range(1, down)), start=picture[0:rows:down])
     total = sum((strips[:, col:cols:across] for col in range(1, across)), start=strips[:, 0:cols:across])
     return np.asarray(total / np.float32(down * across), np.float32)
@@ -89,7 +90,8 @@ def moved_back(image: Image, good: Image, shift_px: tuple[float, float]) -> tupl
 
     `image` is 0 where `good` is 0. See `add_moved_back`.
     """
-    moved, kept = np.zeros_like(image), np.zeros_like(good)
+    moved = np.zeros_like(image)
+    kept = np.zeros_like(good)
     add_moved_back(image, good, shift_px, 1.0, 1.0, moved, kept)
     return moved, kept
 
@@ -113,9 +115,9 @@ def add_moved_back(
 def sinc_taps(part: float) -> Image:
     """Return the 2 TAPS + 1 weights, sum 1, that interpolate at `part` (-0.5 to 0.5) pixels from the middle tap.
 
-    For less than LEAST_PART_PX it is a single weight: nothing is interpolated.
+    For less than MIN_PART_PX it is a single weight: nothing is interpolated.
     """
-    if abs(part) <= LEAST_PART_PX:
+    if abs(part) <= MIN_PART_PX:
         return np.ones(1, np.float32)
     place = np.arange(-TAPS, TAPS + 1) - part
     weights = np.sinc(place) * np.i0(5 * np.sqrt(np.clip(1 - (place / (TAPS + 0.5)) ** 2, 0, 1)))

@@ -55,8 +55,12 @@ class EvidenceWiener:
     input_buffer: Image | None = None
 
     def __init__(self, model: Model, calibration: Calibration) -> None:
-        self.model, self.sensor, self.geometry = model, calibration.sensor, calibration.geometry
-        self.shading, self.prior, self.sample = Shading(model), PowerLawPrior(model), FrequencySample.of(model)
+        self.model = model
+        self.sensor = calibration.sensor
+        self.geometry = calibration.geometry
+        self.shading = Shading(model)
+        self.prior = PowerLawPrior(model)
+        self.sample = FrequencySample.of(model)
         self.fade = taper(model.grid.window, min(0.5, TAPER_PX / model.grid.n / min(model.grid.window)))
         self.x: Image = np.zeros(model.grid.shape, np.float32)
         self.blurred: Image = np.zeros(model.grid.shape, np.float32)
@@ -77,7 +81,9 @@ class EvidenceWiener:
 
     def start(self, frame: Linear) -> None:
         """Compute the solution: `x` becomes the picture on the grid, `diagnostics` the parameters and figures."""
-        model, fft, inside = self.model, self.model.fft, self.model.grid.slices
+        model = self.model
+        fft = self.model.fft
+        inside = self.model.grid.slices
         self.level, self.stray = self.shading.fit(frame, self.x)
         self._blur()
         fft.space[:] = 0
@@ -94,7 +100,8 @@ class EvidenceWiener:
         self.x += fft.space
         self.x *= model.mask
         np.maximum(self.x, 0, out=self.x)
-        mean, law = frame.mean_dn, self.detail.law
+        mean = frame.mean_dn
+        law = self.detail.law
         self.diagnostics = Diagnostics(
             noise_dn=self.detail.noise.variance_dn2(mean) ** 0.5,
             regularisation={
@@ -122,7 +129,8 @@ class EvidenceWiener:
         Noise and prior are estimated from the residual and kept in `detail`. `weight` (the window's shape) is the
         factor of each sample of the residual; 0 in gaps.
         """
-        grid, fft = self.model.grid, self.model.fft
+        grid = self.model.grid
+        fft = self.model.fft
         spectrum = fft.forward()
         energy = float(np.vdot(weight, weight))
         measured = self.sample.noise_variance(self.sample.energies(spectrum), grid.size) * grid.size
@@ -139,7 +147,8 @@ class EvidenceWiener:
 
     def _law(self, fitted: PowerLaw) -> PowerLaw:
         """Return the prior: each of its two parameters as given, else as fitted to the frame."""
-        slope, log_power = self.given.get("prior_slope"), self.given.get("prior_log_power")
+        slope = self.given.get("prior_slope")
+        log_power = self.given.get("prior_log_power")
         if slope is None and log_power is None:
             return fitted
         return PowerLaw(fitted.log_power if log_power is None else log_power, fitted.slope if slope is None else slope)
@@ -149,7 +158,8 @@ class EvidenceWiener:
 
         One step of expectation maximisation for missing data: a gap filled with zeros would add an edge to the picture.
         """
-        fft, inside = self.model.fft, self.model.grid.slices
+        fft = self.model.fft
+        inside = self.model.grid.slices
         spectrum = fft.forward()
         spectrum *= self.model.otf
         predicted = fft.inverse()[inside] * np.float32(1 / self.model.grid.size)
@@ -237,8 +247,10 @@ class TotalVariation(EvidenceWiener):
         `rho` is the penalty parameter for z and w, `stiffness` for v.
         """
         super().start(frame)
-        model, grid = self.model, self.model.grid
-        noise, reg = self.detail.noise, self.detail.reg
+        model = self.model
+        grid = self.model.grid
+        noise = self.detail.noise
+        reg = self.detail.reg
         typical = 1 / noise.variance_dn2(0.5 * float(frame.y.max()))
         rejected = reg / (np.abs(model.otf) ** 2 + reg)
         chosen = KAPPA * float(np.sqrt(typical * np.vdot(self._dual, rejected * rejected)))
@@ -265,7 +277,9 @@ class TotalVariation(EvidenceWiener):
 
     def step(self) -> None:
         """Run one ADMM round: two real FFT pairs."""
-        model, data, image = self.model, self.data_fft, self.model.fft
+        model = self.model
+        data = self.data_fft
+        image = self.model.fft
         fused_kernels.shrink(
             self.x, self._ux, self._uy, self._uw, model.mask, self.tau / self.rho, self._px, self._py, image.space
         )
@@ -294,10 +308,12 @@ class TotalVariation(EvidenceWiener):
         have `coverage` and the flicker figure `banding`.
         """
         super().finish(out)
-        noise, grid = self.detail.noise, self.model.grid
+        noise = self.detail.noise
+        grid = self.model.grid
         residual = fused_kernels.rms_residual(self.blurred, self._y, self._good, noise.per_dn, noise.floor_dn2, grid.at)
         self._add_diagnostics(Diagnostics(residual=residual))
         if isfinite(grid.radius_samples):  # otherwise light from outside the frame causes bands, too
-            left, light_dn = (self._y - self.blurred[grid.slices]) * self._good, self.detail.mean_dn
+            left = (self._y - self.blurred[grid.slices]) * self._good
+            light_dn = self.detail.mean_dn
             banding = image_quality.banding(left, noise.variance_dn2(light_dn), light_dn)
             self._add_diagnostics(Diagnostics(quality={"banding": banding}))

@@ -56,7 +56,8 @@ class OpenFieldTotalVariation(TotalVariation):
     def start(self, frame: Linear) -> None:
         """Compute the evidence solution on the sensor, zero beyond it; then weights, penalties and a first tau."""
         super().start(frame)
-        noise, grid = self.detail.noise, self.model.grid
+        noise = self.detail.noise
+        grid = self.model.grid
         self._typical = 1 / noise.variance_dn2(frame.mean_dn)
         self.rho = RHO * self._typical * self._psf_norm**2
         self.stiffness = STIFF * self._typical
@@ -92,7 +93,8 @@ class OpenFieldTotalVariation(TotalVariation):
     def misfit(self) -> float:
         """Return a robust rms (median / MAD) of the residual in units of each sample's noise: 1 for noise alone."""
         blurred = self.blurred[self.model.grid.slices].reshape(-1)[:: self._stride]
-        y, good = self._y.reshape(-1)[:: self._stride], self._good.reshape(-1)[:: self._stride]
+        y = self._y.reshape(-1)[:: self._stride]
+        good = self._good.reshape(-1)[:: self._stride]
         noise = self.detail.noise
         noise_dn = np.sqrt(noise.per_dn * np.maximum(y, 0) + noise.floor_dn2)
         return float(np.median(np.abs(y - blurred) * good / noise_dn)) / MAD

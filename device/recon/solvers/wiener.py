@@ -66,7 +66,8 @@ class ClosedForm:
 
     def refocus(self) -> None:
         """Recompute all quantities that depend on the OTF of the model."""
-        model, prior = self.model, self.prior
+        model = self.model
+        prior = self.prior
         self.sample = FrequencySample.of(model)
         n = model.grid.n
         self.psf_error_term = prior.psf_error * self.sample.passband_power(n) * (PSF_ERROR_RAD * n) ** 2
@@ -79,7 +80,9 @@ class ClosedForm:
         Parameters: `mu` (relative to |H|^2), `gcv` (score; None for a given mu), `psf_error`, `flat_dn`,
         `background_dn`.
         """
-        model, prior, size = self.model, self.prior, self.model.grid.size
+        model = self.model
+        prior = self.prior
+        size = self.model.grid.size
         self._flat_dn, background = self._load_frame(frame)
         spectrum = model.fft.forward()
         energies = self.sample.energies(spectrum)
@@ -106,7 +109,8 @@ class ClosedForm:
         """Write the frame minus the flat model to the FFT input; return the flat's level and the background in DN.
         Without `prior.subtract_flat` the frame itself is written, and both are 0.
         """
-        model, space = self.model, self.model.fft.space
+        model = self.model
+        space = self.model.fft.space
         model.grid.clear_outside(space)
         if not self.prior.subtract_flat:
             if frame.y is not self.input_buffer:

@@ -26,7 +26,7 @@ _HUMAN_INDEX = 1.336  # of aqueous and vitreous humour
 _RETINA_RADIUS_UM = 12000.0  # OPTICS.md 3.4
 _WIDEST_DEG = 60.0  # of the local effects: farther out, their values at this angle
 _OBLIQUE_AT_DEG = 30.0
-_MOST_SCATTERED = 0.9  # of the light, by a tear film that is broken everywhere
+_MAX_SCATTERED = 0.9  # of the light, by a tear film that is broken everywhere
 
 
 class Tint:
@@ -96,7 +96,8 @@ def brightest_reflex(scene: Scene) -> float:
     """Return the reflex where the blobs overlap most, over the mean signal of the tissue; 0 outside the field."""
     if not _reflex_in_field(scene):
         return 0.0
-    away, wide = _reflex_radius_um(scene), _REFLEX_WIDTH * scene.optics.iris_um
+    away = _reflex_radius_um(scene)
+    wide = _REFLEX_WIDTH * scene.optics.iris_um
     chords = (2 * away * sin(pi * k / LEDS) for k in range(LEDS))
     amid = LEDS * exp(-((away / wide) ** 2) / 2)
     return _reflex_share(scene) * max(sum(exp(-((chord / wide) ** 2) / 2) for chord in chords), amid)
@@ -110,7 +111,8 @@ def _reflex_radius_um(scene: Scene) -> float:
 
 def reflex_blobs(scene: Scene, shape: tuple[int, int]) -> Image:
     """Return the blobs of all LEDs on the sensor, float32 (rows, cols); each peaks at 1, overlapping ones add."""
-    away, wide = _reflex_radius_um(scene), _REFLEX_WIDTH * scene.optics.iris_um
+    away = _reflex_radius_um(scene)
+    wide = _REFLEX_WIDTH * scene.optics.iris_um
     y_um, x_um = ((np.arange(n) - n // 2) * scene.spec.camera.pitch_um for n in shape)
     out = np.zeros(shape, np.float32)
     for led in range(LEDS):
@@ -254,7 +256,8 @@ class ObliqueAstigmatism:
         """Return the size eta, proportional to the root mean square of the cylinder component over the field."""
         if scene.sim.eye.oblique_dpt == 0:
             return Size(0.0, "the meridians of the eye agree over the field")
-        half_deg, off_deg = scene.half_field_deg, hypot(*scene.axis_deg)
+        half_deg = scene.half_field_deg
+        off_deg = hypot(*scene.axis_deg)
         rms_deg2 = sqrt(half_deg**4 / 3 + 2 * half_deg**2 * off_deg**2 + off_deg**4)
         rms_dpt = scene.sim.eye.oblique_dpt / 2 * rms_deg2 / _OBLIQUE_AT_DEG**2
         edge_dpt = scene.sim.eye.oblique_dpt * ((half_deg + off_deg) / _OBLIQUE_AT_DEG) ** 2
@@ -347,7 +350,7 @@ class TearFilm:
 def scattered_share(scene: Scene) -> float:
     """Return the share of the light that the tear film scatters, 0 to 0.9."""
     eye = scene.sim.eye
-    return min(eye.tear_film_per_s * max(eye.since_blink_s - eye.breakup_s, 0.0), _MOST_SCATTERED)
+    return min(eye.tear_film_per_s * max(eye.since_blink_s - eye.breakup_s, 0.0), _MAX_SCATTERED)
 
 
 class Motion:

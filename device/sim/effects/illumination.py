@@ -55,7 +55,8 @@ class Penumbra:
 
 def light_of_cap(scene: Scene, shape: tuple[int, ...]) -> Image:
     """Return the intensity over that on the axis in the middle of `shape` (rows, cols), float32; 1 without a cap."""
-    cap, magnification = scene.cap, scene.optics.angular_magnification
+    cap = scene.cap
+    magnification = scene.optics.angular_magnification
     if cap is None:
         return np.ones(shape, np.float32)
     places = ((np.arange(n) - (n - 1) / 2) / scene.geometry.px_per_deg for n in shape)
@@ -135,7 +136,8 @@ def leds_mm(scene: Scene) -> list[Place]:
     if chain is not None:
         at = led_positions_mm(chain)
         return [(at[i][0], -at[i][1]) for i in ring(chain)]
-    radius, turns = scene.sim.light.ring_um / 2000, (2 * pi * k / LEDS for k in range(LEDS))
+    radius = scene.sim.light.ring_um / 2000
+    turns = (2 * pi * k / LEDS for k in range(LEDS))
     return [(radius * cos(turn), radius * sin(turn)) for turn in turns]
 
 
@@ -144,7 +146,8 @@ def _drives(scene: Scene) -> NDArray[np.float64]:
 
     The shares sum to 1, and the dead LED has 0. SpecError for a dead LED that the ring does not have.
     """
-    light, count = scene.sim.light, len(leds_mm(scene))
+    light = scene.sim.light
+    count = len(leds_mm(scene))
     draws = np.random.default_rng((scene.seed, 9)).standard_normal(count)
     drive = np.maximum(1 + light.led_spread * draws, 0.0)
     if light.dead_led is not None:
@@ -156,7 +159,8 @@ def _drives(scene: Scene) -> NDArray[np.float64]:
 
 def _clearance_mm(scene: Scene) -> float:
     """Return the least distance between a ray of the field and the pupil's edge, at the pupil; < 0 if rays are cut."""
-    a, eye = scene.optics.angular_magnification, scene.sim.eye
+    a = scene.optics.angular_magnification
+    eye = scene.sim.eye
     walk = a**2 * abs(scene.sim.light.ring_offset_um) / 1000 * radians(scene.half_field_deg)
     off = max(hypot(a * x - eye.decentred_um / 1000, a * y) for x, y in leds_mm(scene))
     return eye.pupil_um / 2000 - a * EMITTER_MM / 2 - off - walk
@@ -173,12 +177,15 @@ def lit_share(scene: Scene, right_deg: NDArray[np.float64], down_deg: NDArray[np
 
     Places are degrees right and down from the axis. SpecError if no light enters the pupil for any of them.
     """
-    a, eye = scene.optics.angular_magnification, scene.sim.eye
+    a = scene.optics.angular_magnification
+    eye = scene.sim.eye
     slope_mm = a**2 * scene.sim.light.ring_offset_um / 1000  # at the pupil, per unit of theta
-    pupil, emitter = eye.pupil_um / 2000, a * EMITTER_MM / 2
+    pupil = eye.pupil_um / 2000
+    emitter = a * EMITTER_MM / 2
     steps = np.linspace(max(pupil - emitter, 0), pupil + emitter, _EDGE_STEPS)
     passed = [iris_overlap(float(at), pupil, emitter) for at in steps]
-    right, down = slope_mm * np.radians(right_deg), slope_mm * np.radians(down_deg)
+    right = slope_mm * np.radians(right_deg)
+    down = slope_mm * np.radians(down_deg)
     lit = np.zeros(np.broadcast_shapes(right.shape, down.shape))
     for (x, y), drive in zip(leds_mm(scene), _drives(scene), strict=True):
         lit += drive * np.interp(np.hypot(a * x - eye.decentred_um / 1000 - right, a * y - down), steps, passed)

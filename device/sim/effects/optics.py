@@ -22,14 +22,16 @@ class PupilVignetting:
 
     def size(self, scene: Scene) -> Size:
         """Return the size eta, proportional to the uncovered width of the iris, mm, for light from the field's edge."""
-        shift, margin = _beam_shift_mm(scene, scene.half_field_deg), _shift_margin_mm(scene)
+        shift = _beam_shift_mm(scene, scene.half_field_deg)
+        margin = _shift_margin_mm(scene)
         why = f"at the edge the beam is {shift:.2f} mm off, and the iris is filled up to {margin:.2f} mm"
         return Size(_VIGNETTING_ETA_PER_MM * max(shift - margin, 0.0) * scene.weight, why)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Register the function that gives each place's shift (right, down) of the beam from the iris's centre, um."""
         scene = setup.scene
-        eye, m = scene.sim.eye, 1 / scene.optics.angular_magnification
+        eye = scene.sim.eye
+        m = 1 / scene.optics.angular_magnification
 
         def beam_shift_um(place: Place) -> tuple[float, float]:
             turn, angle_deg = azimuth_and_angle(place)
@@ -42,7 +44,8 @@ class PupilVignetting:
 
 def _beam_shift_mm(scene: Scene, angle_deg: float) -> float:
     """Return the largest distance between the centres of beam and iris at this angle, mm."""
-    eye, m = scene.sim.eye, 1 / scene.optics.angular_magnification
+    eye = scene.sim.eye
+    m = 1 / scene.optics.angular_magnification
     walk = beam_walk_mm(angle_deg) if eye.walks else 0.0
     return walk + m * (eye.decentred_um + abs(eye.axial_um) * tan(radians(angle_deg))) / 1000
 

@@ -135,7 +135,8 @@ class HotPixels:
 
     def size(self, scene: Scene) -> Size:
         """Return the rms error, full well times sqrt(share), over the noise of a pixel."""
-        share, camera = scene.sim.sensor.hot_pixels, scene.spec.camera
+        share = scene.sim.sensor.hot_pixels
+        camera = scene.spec.camera
         error_e = camera.full_well_e * sqrt(share)
         return Size(error_e / scene.noise_e, f"{share * camera.rows * camera.cols:.0f} pixels are full")
 
@@ -189,7 +190,8 @@ class Saturation:
     def size(self, scene: Scene) -> Size:
         """Return 0 if no pixel is hot and the brightest stays six sigmas below the full well, else a large eta."""
         full_e = scene.spec.camera.full_well_e
-        flaws, exposure_s = scene.sim.sensor, scene.spec.camera.exposure_s
+        flaws = scene.sim.sensor
+        exposure_s = scene.spec.camera.exposure_s
         veils = scene.sim.light.stray + scene.sim.light.ambient + brightest_reflex(scene)
         even_e = scene.peak_e * (1 + veils) + flaws.dark_e_per_s * exposure_s
         noise_e = sqrt(even_e + scene.spec.camera.read_noise_e**2 + flaws.dsnu_e**2)

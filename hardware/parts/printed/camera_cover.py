@@ -14,8 +14,10 @@ CABLE_MM = (18.0, 2.0)
 def camera_cover(d: Dimensions) -> Part:
     """A box over board and spacer, down to the cell: its rim lets no light in, and the cable leaves upwards."""
     back = d.board_z_mm + d.bought.board_thick_mm
-    begin, end = d.cell_rear_z_mm + d.fit.slide_mm, back + ROOM_MM + d.fit.wall_mm
-    inside, half = d.bought.board_mm + 2 * d.fit.slide_mm, d.bought.board_holes_mm / 2
+    begin = d.cell_rear_z_mm + d.fit.slide_mm
+    end = back + ROOM_MM + d.fit.wall_mm
+    inside = d.bought.board_mm + 2 * d.fit.slide_mm
+    half = d.bought.board_holes_mm / 2
     shell = square(inside + 2 * d.fit.wall_mm, (begin, end), d.fit.chamfer_mm)
     shell -= square(inside, (begin, back + ROOM_MM))
     at = [(i * half, j * half) for i, j in FOUR]

@@ -17,7 +17,8 @@ def nose_z_mm(d: Dimensions) -> float:
 
 def chart_piston(d: Dimensions) -> Part:
     """Drawn with one ring, so in focus; a notch in the flange marks the top of the chart."""
-    nose, end = nose_z_mm(d), pinhole_piston.rear_z_mm(d) - d.bought.eye_step_mm
+    nose = nose_z_mm(d)
+    end = pinhole_piston.rear_z_mm(d) - d.bought.eye_step_mm
     flange = (end - pinhole_piston.FLANGE_MM, end)
     body = rod(d.bought.eye_lens_mm - d.fit.slide_mm, (end, nose)) + rod(pinhole_piston.WIDE_MM, flange)
     return body - rod(NOTCH_MM, flange, (0, pinhole_piston.WIDE_MM / 2))

@@ -22,7 +22,8 @@ def pocket_z_mm(d: Dimensions) -> float:
 
 def diffuser_cell(d: Dimensions) -> Part:
     """A plate with a stepped bore; every thread is a heat-set insert, but for the three M2 of the retaining ring."""
-    front, rear = d.cell_front_z_mm, d.cell_rear_z_mm
+    front = d.cell_front_z_mm
+    rear = d.cell_rear_z_mm
     wide, high = SIZE_MM
     body = box((-wide / 2, wide / 2), (-high / 2, high / 2), (front, rear), 2 * d.fit.chamfer_mm)
     body += rod(SPIGOT_MM, (d.spigot_z_mm, front))

@@ -14,7 +14,8 @@ def dust_cap(d: Dimensions) -> Part:
     """A cup; drawn where the eye would be, around the lenses' axis."""
     relay = d.path.relay
     floor = -(relay.second_mm * 2 + relay.first_mm) - 40
-    at, inside = (0, d.lens_y_mm), d.bought.tube_mm + d.fit.slide_mm
+    at = (0, d.lens_y_mm)
+    inside = d.bought.tube_mm + d.fit.slide_mm
     return rod(inside + 2 * WALL_MM, (floor, floor + DEEP_MM + WALL_MM), at) - rod(
         inside, (floor + WALL_MM, floor + DEEP_MM + WALL_MM), at
     )

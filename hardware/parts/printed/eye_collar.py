@@ -33,10 +33,15 @@ def socket_z_mm(d: Dimensions) -> tuple[float, float]:
 
 def eye_collar(d: Dimensions) -> Part:
     """Two sockets with three M3 grub screws each: those of the tubes clamp, those of the eye also tilt it."""
-    pupil, face = model_eye_tube.pupil_z_mm(d), model_eye_tube.face_z_mm(d)
+    pupil = model_eye_tube.pupil_z_mm(d)
+    face = model_eye_tube.face_z_mm(d)
     socket, rim = socket_z_mm(d)
-    card, tube = CARD_MM + d.fit.slide_mm, d.bought.tube_mm + 2 * d.fit.slide_mm
-    narrow, wide, rear, seat = card + 2 * WALL_MM, tube + 2 * WALL_MM, pupil - GRIP_MM, face + SEAT_MM
+    card = CARD_MM + d.fit.slide_mm
+    tube = d.bought.tube_mm + 2 * d.fit.slide_mm
+    narrow = card + 2 * WALL_MM
+    wide = tube + 2 * WALL_MM
+    rear = pupil - GRIP_MM
+    seat = face + SEAT_MM
     flare = seat + (wide - narrow) / 2
     body = rod(narrow, (rear, seat)) + cone(narrow, wide, (seat, flare)) + rod(wide, (flare, rim))
     body -= rod(card, (rear, pupil))

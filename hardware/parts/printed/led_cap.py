@@ -11,17 +11,21 @@ COLLAR_MM = 0.6  # how far the baffles between the LEDs reach down towards their
 
 def outline_mm(d: Dimensions) -> tuple[tuple[float, float], tuple[float, float]]:
     """(x, z) ranges of cap and cover: the board and a wall around it."""
-    (x, z), (wide, high) = d.led_board_at_mm, d.bought.led_board_mm
+    (x, z) = d.led_board_at_mm
+    (wide, high) = d.bought.led_board_mm
     more = d.fit.slide_mm + d.fit.wall_mm
     return (x - wide / 2 - more, x + wide / 2 + more), (z - high / 2 - more, z + high / 2 + more)
 
 
 def led_cap(d: Dimensions) -> Part:
     """The ears of the board lie on it, so the LEDs stand at their distance whatever the cover does."""
-    part, fit, front = d.bought, d.fit, d.cap_front_y_mm
+    part = d.bought
+    fit = d.fit
+    front = d.cap_front_y_mm
     board = d.led_y_mm + part.led_high_mm
     (x0, x1), (z0, z1) = outline_mm(d)
-    (x, z), (wide, high) = d.led_board_at_mm, part.led_board_mm
+    (x, z) = d.led_board_at_mm
+    (wide, high) = part.led_board_mm
     body = box((x0, x1), (front, board + part.led_board_thick_mm), (z0, z1))
     half = wide / 2 + fit.slide_mm, high / 2 + fit.slide_mm
     body -= box((x - half[0], x + half[0]), (board, board + 9), (z - half[1], z + half[1]))

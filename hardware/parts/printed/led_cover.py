@@ -15,9 +15,11 @@ WIRES_MM = 10.0
 
 def led_cover(d: Dimensions) -> Part:
     """A lid with a pillar on every ear of the board."""
-    fit, back = d.fit, d.led_y_mm + d.bought.led_high_mm + d.bought.led_board_thick_mm
+    fit = d.fit
+    back = d.led_y_mm + d.bought.led_high_mm + d.bought.led_board_thick_mm
     (x0, x1), (z0, z1) = outline_mm(d)
-    roof, wall = back + ROOM_MM, fit.wall_mm
+    roof = back + ROOM_MM
+    wall = fit.wall_mm
     body = box((x0, x1), (back, roof + ROOF_MM), (z0, z1))
     body -= box((x0 + wall, x1 - wall), (back, roof), (z0 + wall, z1 - wall))
     body += joined(rod_y(PILLAR_MM, (back, roof), at) for at in d.led_screws_mm)

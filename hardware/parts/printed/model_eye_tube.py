@@ -18,7 +18,8 @@ SHOULDER_MM = 23.0
 
 def seat_z_mm(d: Dimensions) -> float:
     """Where the round lens lies on the shoulder's inner edge."""
-    radius, half = d.bought.eye_lens_radius_mm, SHOULDER_MM / 2
+    radius = d.bought.eye_lens_radius_mm
+    half = SHOULDER_MM / 2
     return d.bought.eye_lens_thick_mm / 2 - (radius - (radius**2 - half**2) ** 0.5)
 
 
@@ -34,8 +35,11 @@ def face_z_mm(d: Dimensions) -> float:
 
 def model_eye_tube(d: Dimensions) -> Part:
     """The lens drops in from behind onto a shoulder; the pupil's edge is sharp on the lens's side."""
-    part, slide = d.bought, d.fit.slide_mm
-    seat, vertex, end = seat_z_mm(d), pupil_z_mm(d), face_z_mm(d)
+    part = d.bought
+    slide = d.fit.slide_mm
+    seat = seat_z_mm(d)
+    vertex = pupil_z_mm(d)
+    end = face_z_mm(d)
     body = rod(WIDE_MM, (pinhole_piston.rear_z_mm(d), end))
     body -= rod(part.eye_lens_mm + slide, (pinhole_piston.rear_z_mm(d), seat))
     body -= rod(SHOULDER_MM, (seat, vertex)) + rod(part.eye_pupil_mm, (vertex, end))

@@ -25,7 +25,8 @@ def nose_z_mm(d: Dimensions, rings: int) -> float:
 
 def pinhole_piston(d: Dimensions) -> Part:
     """Drawn with one ring, so in focus; the foil lies in a pocket as deep as it is thick."""
-    nose, end = nose_z_mm(d, 1), rear_z_mm(d) - d.bought.eye_step_mm
+    nose = nose_z_mm(d, 1)
+    end = rear_z_mm(d) - d.bought.eye_step_mm
     body = rod(d.bought.eye_lens_mm - d.fit.slide_mm, (end, nose)) + rod(WIDE_MM, (end - FLANGE_MM, end))
     foil = rod(d.bought.pinhole_foil_mm + d.fit.slide_mm, (nose - d.bought.pinhole_foil_thick_mm, nose))
     return body - foil - rod(WINDOW_MM, (end, nose)) - rod(LED_MM, (end - FLANGE_MM, nose - 3))

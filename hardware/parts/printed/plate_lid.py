@@ -13,8 +13,10 @@ OVERLAP_MM = 2.0
 
 def plate_lid(d: Dimensions) -> Part:
     """A lid with a tongue as long as the room beside the plate, less a film of foam."""
-    fit, glass = d.fit, d.plate_thick_mm
-    plate, around = d.path.relay.splitter_mm / 2, LID_SCREW_MM + 2 * OVERLAP_MM
+    fit = d.fit
+    glass = d.plate_thick_mm
+    plate = d.path.relay.splitter_mm / 2
+    around = LID_SCREW_MM + 2 * OVERLAP_MM
     x = (-HALF_MM - THICK_MM, -HALF_MM)
     body = slab(d, x, plate + OVERLAP_MM, (glass / 2 - around, glass / 2 + around))
     body &= box(x, (-2 * plate, 2 * plate), d.block_z_mm)  # its corners would be in the way of tube and cell

@@ -24,7 +24,8 @@ def lever_z_mm(d: Dimensions) -> float:
 
 def polariser_ring(d: Dimensions) -> Part:
     """A ring with a pocket for the film, which the cell's floor closes."""
-    rear, film = recess_z_mm(d)[1], d.bought.film_mm + d.fit.slide_mm
+    rear = recess_z_mm(d)[1]
+    film = d.bought.film_mm + d.fit.slide_mm
     pocket = rod(film, (rear - d.bought.film_thick_mm - d.fit.slide_mm, rear))
     lever = rod_y(d.fit.m2_forms_mm, (WIDE_MM / 2 - LEVER_DEEP_MM, WIDE_MM / 2), (0, lever_z_mm(d)))
     opening = rod(d.bought.film_mm - 2, (rear - THICK_MM, rear))

@@ -23,7 +23,8 @@ LID_SCREW_MM = 6.5  # from the slot's middle, either way, square to the plate
 
 def along_plate(d: Dimensions, along_mm: float, deep_mm: float) -> tuple[float, float]:
     """(y, z) of a place so far along the tilted plate and so deep behind its coated face."""
-    u, v = (cos(pi / 4), sin(pi / 4)), (-cos(pi / 4), sin(pi / 4))
+    u = (cos(pi / 4), sin(pi / 4))
+    v = (-cos(pi / 4), sin(pi / 4))
     return (
         d.lens_y_mm + along_mm * u[0] + deep_mm * v[0],
         d.plate_z_mm + along_mm * u[1] + deep_mm * v[1],
@@ -50,9 +51,13 @@ def tube_screws_mm(d: Dimensions) -> list[tuple[float, float]]:
 
 def splitter_block(d: Dimensions) -> Part:
     """A block with two crossing bores as wide as the plate looks, and a slot that ends where the plate does."""
-    fit, (front, rear), top = d.fit, d.block_z_mm, d.cap_front_y_mm
+    fit = d.fit
+    (front, rear) = d.block_z_mm
+    top = d.cap_front_y_mm
     body = box((-HALF_MM, HALF_MM), (FLOOR_Y_MM, top), (front, rear), fit.chamfer_mm, along=Axis.Y)
-    lens, bore, plate = (0, d.lens_y_mm), d.plate_seen_mm, d.path.relay.splitter_mm / 2 + fit.slide_mm
+    lens = (0, d.lens_y_mm)
+    bore = d.plate_seen_mm
+    plate = d.path.relay.splitter_mm / 2 + fit.slide_mm
     body -= rod(bore, (front, rear), lens) + cone(bore, d.light_mm(front), (d.plate_z_mm, front), lens)
     body -= rod_y(bore, (FLOOR_Y_MM + TRAP_MM, top), (0, d.plate_z_mm))
     body -= rod(diffuser_cell.SPIGOT_MM + fit.slide_mm, (d.spigot_z_mm - fit.press_mm, rear))

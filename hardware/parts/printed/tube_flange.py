@@ -20,7 +20,8 @@ def tube_z_mm(d: Dimensions) -> tuple[float, float]:
 def tube_flange(d: Dimensions) -> Part:
     """A plate with countersunk screws, and a socket with three clamping screws."""
     rim, floor = tube_z_mm(d)
-    rear, lens = d.block_z_mm[0], (0, d.lens_y_mm)
+    rear = d.block_z_mm[0]
+    lens = (0, d.lens_y_mm)
     inside = d.bought.tube_mm + 2 * d.fit.slide_mm
     body = rod(inside + 2 * WALL_MM, (rim, rear), lens) - rod(inside, (rim, floor), lens)
     body -= rod(d.light_mm(floor), (floor, rear), lens)

@@ -151,7 +151,9 @@ def _trial_lens_router(arbiter: HeadArbiter) -> APIRouter:
 
 def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
     """Return the state of the calibration procedure, its errors and the archived calibrations."""
-    spec, archive, owner = arbiter.context.spec, arbiter.context.archive, arbiter.owner
+    spec = arbiter.context.spec
+    archive = arbiter.context.archive
+    owner = arbiter.owner
     problem = owner.problem
     now = _session_state(owner)
     kept = _listed(archive)
@@ -220,8 +222,10 @@ def intact_calibration(stored: StoredCalibration) -> IntactCalibration:
     `psf_spread_px` is the effective number of pixels of the PSF: squared sum over sum of squares. `trial_offset_dpt` is
     the offset of M by trial lenses.
     """
-    calibration, made = stored.calibration, stored.provenance
-    psf, off = calibration.psfs[0].pixels, calibration.refraction_offset
+    calibration = stored.calibration
+    made = stored.provenance
+    psf = calibration.psfs[0].pixels
+    off = calibration.refraction_offset
     numbers = dict(made.figures) | asdict(calibration.sensor)
     numbers |= {"psf_spread_px": float(psf.sum(dtype=np.float64) ** 2 / np.square(psf, dtype=np.float64).sum())}
     if off is not None:

@@ -41,7 +41,8 @@ def press_router(
         invalid body, 423 without a valid calibration. Failed after it: 409 if the consent was withdrawn, 423 if light,
         heat or power forbid the exposure, 503 if a part of the head does not answer, 507 if the disk is full.
         """
-        key, pictures = press.key, repository.pictures
+        key = press.key
+        pictures = repository.pictures
         known_id = pictures.capture_for_key(key, press.eye, press.visit, press.slot) if key else None
         if known_id is not None:  # answered before a restart of the server
             return capture_answer(store.get(known_id))

@@ -40,7 +40,8 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
         or can only be read, 507 if it is full.
         """
         visit = repository.get(id)
-        key, request = order.key, f"export {id} {order.folder}"
+        key = order.key
+        request = f"export {id} {order.folder}"
         copied = repository.requests.run_once(
             key, request, lambda: _copied(store, repository, visit, drives.mounted_folder(order.folder))
         )

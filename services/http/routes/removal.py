@@ -11,7 +11,8 @@ def removal_routes(removal: PictureRemoval) -> APIRouter:
     router = APIRouter(prefix="/api/technician/removal")
 
     def answer() -> RemovalAnswer:
-        now, (captures, size_bytes) = removal.removable(), removal.undoable()
+        now = removal.removable()
+        (captures, size_bytes) = removal.undoable()
         return RemovalAnswer(
             visits=now.visits,
             captures=sum(map(len, now.captures.values())),

@@ -55,7 +55,8 @@ def status_router(
 
         `ok` is true if all checks pass; `battery` is the charge from 0 to 1, or null.
         """
-        is_dark, now = wait_until_dark(arbiter), read_status(arbiter)
+        is_dark = wait_until_dark(arbiter)
+        now = read_status(arbiter)
         unsent = None if upload_worker is None else upload_worker.waiting_and_stuck()
         context = arbiter.context
         collected = collect_status(now, is_dark, context.store, repository, context.clock, unsent)
@@ -80,7 +81,10 @@ def status_answer(
     upload_worker: UploadWorker | None,
 ) -> StatusAnswer:
     """Return the status of the instrument."""
-    spec, head, problem, store = arbiter.context.spec, arbiter.head, arbiter.problem, arbiter.context.store
+    spec = arbiter.context.spec
+    head = arbiter.head
+    problem = arbiter.problem
+    store = arbiter.context.store
     radius_px = field_radius_px(head.calibration) if head is not None else float("inf")
     return StatusAnswer(
         name=spec.name,

@@ -20,7 +20,8 @@ def trial_lens_answer(owner: HeadOwner) -> TrialLensAnswer | None:
         return _finished(owner.last_lenses)
     if not isinstance(owner.session, TrialLensSession):
         return None
-    bench, now = owner.session.bench, owner.session.snapshot()
+    bench = owner.session.bench
+    now = owner.session.snapshot()
     current = now.lens if now.state != "begin" else None
     return TrialLensAnswer(
         state=now.state,
@@ -37,7 +38,8 @@ def trial_lens_answer(owner: HeadOwner) -> TrialLensAnswer | None:
 
 
 def _finished(run: TrialLensOutcome) -> TrialLensAnswer:
-    fit, stored = run.fit, run.stored
+    fit = run.fit
+    stored = run.stored
     return TrialLensAnswer(
         state="done",
         lens=None,

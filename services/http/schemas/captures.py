@@ -222,7 +222,8 @@ class CaptureList(ResponseBody):
 
 def capture_answer(capture: Capture) -> CaptureAnswer:
     """Return a capture with its report, its verdict and the URLs of its files."""
-    at, report = f"/api/captures/{capture.id}", capture.report
+    at = f"/api/captures/{capture.id}"
+    report = capture.report
     links = CaptureLinks(
         picture=f"{at}/picture.png",
         colour=f"{at}/{COLOUR}" if COLOUR in capture.files else None,

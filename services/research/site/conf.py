@@ -85,7 +85,8 @@ def shorten_types(
 ) -> tuple[str | None, str | None]:
     """Return a signature with the names of the project for types of arrays, and `...` for the default of a factory."""
     array = r"(?:~numpy\.)?ndarray\[tuple\[(?:~typing\.)?Any, \.\.\.\], (?:~numpy\.)?dtype\[(?:~\w+\.)?{}\]\]"
-    image, source = array.format("float32"), r"str \| (?:~pathlib\.)?Path \| " + array.format("Any")
+    image = array.format("float32")
+    source = r"str \| (?:~pathlib\.)?Path \| " + array.format("Any")
     names = ((source, "ImageSource"), (image, "Image"), ("<factory>", "..."))  # `<` ends the parsing of a signature
     texts = [signature, returns]
     for pattern, short in names:

@@ -12,7 +12,7 @@ from tests.ports.emulators.wires import LoggedChain
 
 PATIENCE_S = 5.0
 STEP_S = 0.005
-DARK_S, MOST_DARK_S = 0.1, 0.25  # limit after the end of a process or lease, and with any delay of the machine
+DARK_S, MAX_DARK_S = 0.1, 0.25  # limit after the end of a process or lease, and with any delay of the machine
 NEGLIGIBLE_S = 0.01  # delay of a machine that is not busy: the limit is then DARK_S
 
 
@@ -54,7 +54,7 @@ class Sleeper:
 
 def dark_limit_s(late_s: float) -> float:
     """Return how soon the lamp must be dark on a machine that delays a sleep by `late_s`."""
-    return DARK_S if late_s < NEGLIGIBLE_S else min(DARK_S + late_s, MOST_DARK_S)
+    return DARK_S if late_s < NEGLIGIBLE_S else min(DARK_S + late_s, MAX_DARK_S)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class LitProcess:
         was_lit = bool(self._lit_before(died_s))
         while self._wires.lit:
             if time.monotonic() - died_s > PATIENCE_S:
-                return self._reaped(KillResult(how, was_lit, float("inf"), MOST_DARK_S))
+                return self._reaped(KillResult(how, was_lit, float("inf"), MAX_DARK_S))
             time.sleep(STEP_S)
         dark_s = died_s
         for one in reversed(self._wires.messages):  # the first of the trailing off messages

@@ -16,9 +16,9 @@ from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.model.kernels import Pixels, Places
 
-LEAST_FRAMES = 3  # for a scatter
+MIN_FRAMES = 3  # for a scatter
 LARGEST_STEP_DPT = 1.4  # beyond it a step is no estimate
-MOST_SCATTER_DPT = 0.7  # half of the largest step
+MAX_SCATTER_DPT = 0.7  # half of the largest step
 
 Floats = NDArray[np.float64]
 BurstFrame = tuple[Pixels, Pixels | None, Places | None]  # counts, dark frame, defective pixels

@@ -28,12 +28,12 @@ from device.recon.model.fft_plans import Planner
 MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
 VARIANCE_PER_MISFIT = 1.7  # of the misfit: the detail takes up a quarter of the residual; the rest is correlated
 BIAS_SHARE = 0.7  # of b: sd by its own error, as b is taken at the fit and not at the true retina
-MOST_STEPS = 12  # 2 to 4 are usual
+MAX_STEPS = 12  # 2 to 4 are usual
 BIAS_STEPS = 2  # first steps, for which the bias of a noise-free frame is computed
 FULL_STEPS = 3  # first steps; later ones are halved: some frames overshoot by a factor of two
 NOISE_DRAWS = 2  # for the bias by noise: their scatter adds 3 % to the sd
 SETTLED_SDS = 0.2
-MOST_MISFIT = 1.2
+MAX_MISFIT = 1.2
 LARGEST_STEP_DPT = 0.7
 
 Floats = NDArray[np.float64]
@@ -56,7 +56,7 @@ class Refined:
     @property
     def is_explained(self) -> bool:
         """True if the model explains the frame."""
-        return self.misfit < MOST_MISFIT
+        return self.misfit < MAX_MISFIT
 
     @property
     def sds_dpt(self) -> Floats:
@@ -69,7 +69,8 @@ class CropRefinement:
     """Refinement of the eyes that an `EdgeLikelihood` has found, on the same grid, for a PSF with this radius."""
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
-        self._edges, self._model = edges, CropModel(edges, planner, psf_radius_px)
+        self._edges = edges
+        self._model = CropModel(edges, planner, psf_radius_px)
 
     def steps(self, eye_dpt: Floats, edge: FieldEdge, frames: Sequence[BurstFrame]) -> Floats:
         """Return the step of each frame of a burst from an eye, as `frame_steps` does."""
@@ -77,10 +78,14 @@ class CropRefinement:
 
     def __call__(self, eye_dpt: Floats) -> Refined:
         """Return the refinement of an eye (M, J0, J45) of the frame that `edges` was started with."""
-        light, model, detail = self._edges.frame.y, self._model, None
+        light = self._edges.frame.y
+        model = self._model
+        detail = None
         model.start(eye_dpt)
-        is_cropped, without_noise, by_noise = model.seen_share < 1, np.zeros(3), np.zeros(3)
-        for done in range(MOST_STEPS):
+        is_cropped = model.seen_share < 1
+        without_noise = np.zeros(3)
+        by_noise = np.zeros(3)
+        for done in range(MAX_STEPS):
             model.focus(eye_dpt)
             fit = model.fit(light, detail)
             detail = fit.detail
@@ -109,7 +114,9 @@ class CropRefinement:
         The fit is linear, and its score a quadratic form of the frame: over both signs of a noise it grows by the score
         of the noise alone. Steps by 20 iterations differ from that by up to 0.003 dpt, by 200 by 0.0002.
         """
-        noise, random, total = self._edges.noise, np.random.default_rng(0), np.zeros(3)
+        noise = self._edges.noise
+        random = np.random.default_rng(0)
+        total = np.zeros(3)
         sd_dn = np.sqrt(noise.per_dn * np.maximum(fit.expected, 0) + noise.floor_dn2).astype(np.float32)
         for _ in range(NOISE_DRAWS):
             noise_dn = random.standard_normal(sd_dn.shape, np.float32) * sd_dn

@@ -20,7 +20,7 @@ from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, RealFft, Spectrum
-from device.recon.model.preprocessing import LEAST_GOOD, Linear
+from device.recon.model.preprocessing import MIN_GOOD, Linear
 from device.values import Image
 
 COSINES = 10  # per axis
@@ -28,9 +28,9 @@ DETAIL_EXPONENT = -2.5  # of the spectrum P; exponents from -2 to -3 give the sa
 REFERENCE = 0.1  # cycles per sample, at which the level of P is fitted to the rings
 FLATTEST = 0.02  # cycles per sample, below which P is constant
 FITTED_RINGS = 10
-LEAST_LEVEL = 1e-4  # of the highest one; a ring without detail has a floor instead of a level
+MIN_LEVEL = 1e-4  # of the highest one; a ring without detail has a floor instead of a level
 MARGIN_SAMPLES = 4.0  # from the end of the edge to the end of the object
-MOST_ITERATIONS = 30  # of conjugate gradients; 40, 80 and 300 move an estimate by up to 0.3 sd, the RMS error stays
+MAX_ITERATIONS = 30  # of conjugate gradients; 40, 80 and 300 move an estimate by up to 0.3 sd, the RMS error stays
 COVARIANCE_ITERATIONS = 20  # for covariance and bias: the sds change by 1 % at the most
 RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
 DARK_SHARE = 0.1  # of the mean
@@ -61,7 +61,8 @@ class Weighting:
         They follow the local mean: by a sample itself, noise would weigh itself, and choose its own samples. Samples
         darker than `least_dn`, or than DARK_SHARE of the mean if that is less, have none; 0: all are used.
         """
-        model_dn, is_used = MODEL_SHARE * frame.mean_dn, frame.good >= LEAST_GOOD
+        model_dn = MODEL_SHARE * frame.mean_dn
+        is_used = frame.good >= MIN_GOOD
         near = ndimage.uniform_filter(np.where(is_used, frame.y, 0), NEAR_SAMPLES)
         near /= np.maximum(ndimage.uniform_filter(is_used.astype(np.float32), NEAR_SAMPLES), 1 / NEAR_SAMPLES**2)
         variance_dn2 = noise.per_dn * np.maximum(near, 0) + noise.floor_dn2 + model_dn**2
@@ -108,7 +109,8 @@ class CropModel:
     """
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
-        self._edges, grid = edges, edges.grid
+        self._edges = edges
+        grid = edges.grid
         self._grid = grid
         self._psf_samples = psf_radius_px / grid.n
         self._fft: RealFft = planner.plan(grid.shape)
@@ -121,7 +123,8 @@ class CropModel:
         self._twice[0] = 1
         if cols % 2 == 0:
             self._twice[-1] = 1
-        self._otf, self.seen_share = np.zeros(frequency.shape, np.complex64), 1.0
+        self._otf = np.zeros(frequency.shape, np.complex64)
+        self.seen_share = 1.0
 
     def start(self, eye_dpt: Floats) -> None:
         """Set the weights of the frame's samples, and the object's prior from the likelihood of an eye."""
@@ -137,7 +140,7 @@ class CropModel:
         self._slopes = [self._slope(eye_dpt, axis) for axis in np.eye(3) * DERIVATIVE_STEP_DPT]
         self._preconditioner = (1 / (1 + self._mean_weight * power)).astype(np.float32)
 
-    def fit(self, light: Image, start: Spectrum | None, most: int = MOST_ITERATIONS) -> Fit:
+    def fit(self, light: Image, start: Spectrum | None, most: int = MAX_ITERATIONS) -> Fit:
         """Return the fit of a frame for the eye in focus, with a smooth part of its own, from the detail `start` on."""
         smooth = self._edges.field.fit(replace(self._edges.frame, y=light), self._otf, self._edges.edge).image
         seen = self._seen(self._spectrum(smooth))
@@ -157,7 +160,8 @@ class CropModel:
 
     def _set_prior(self, eye_dpt: Floats) -> None:
         """Set the object's reach from the edge, and the level of its detail from the rings of the likelihood."""
-        edges, edge = self._edges, self._edges.edge
+        edges = self._edges
+        edge = self._edges.edge
         frequencies, levels = detail_levels(edges, eye_dpt)
         lit = np.pi * edge.radius_samples**2
         seen = self.seen_share = float(np.prod(self._grid.window)) / (
@@ -222,16 +226,16 @@ class CropModel:
         fused_kernels.filtered(self._adjoint_in_fft(frame), self._root, adjoint)
         return adjoint
 
-    def _solve(
-        self, frame: Image, start: Spectrum | None, most: int = MOST_ITERATIONS
-    ) -> tuple[Spectrum, Image, Image]:
+    def _solve(self, frame: Image, start: Spectrum | None, most: int = MAX_ITERATIONS) -> tuple[Spectrum, Image, Image]:
         """Return the whitened spectrum of a frame's detail, K^-1 times the frame, and the frame of the detail."""
         detail = np.zeros_like(self._otf) if start is None else start.copy()
         fitted = np.zeros(self._grid.window, np.float32) if start is None else self._blurred(detail)
         rest = self._adjoint(self._weighting(frame - fitted)) - detail
         first = fused_kernels.squared_length(self._adjoint(self._weighting(frame)), self._preconditioner, self._twice)
-        direction, moved = np.zeros_like(rest), np.empty_like(rest)
-        size, ratio = fused_kernels.squared_length(rest, self._preconditioner, self._twice), 0.0
+        direction = np.zeros_like(rest)
+        moved = np.empty_like(rest)
+        size = fused_kernels.squared_length(rest, self._preconditioner, self._twice)
+        ratio = 0.0
         for _ in range(most):
             if size <= RESIDUAL_SHARE * first:
                 break
@@ -239,7 +243,8 @@ class CropModel:
             seen = self._blurred(direction)
             normal = self._adjoint_in_fft(self._weighting(seen))
             curvature = fused_kernels.add_normal_part(normal, self._root, direction, self._twice, moved)
-            factor, before = size / curvature, size
+            factor = size / curvature
+            before = size
             size = fused_kernels.step_along(factor, direction, moved, self._preconditioner, self._twice, detail, rest)
             fitted += np.float32(factor) * seen
             ratio = size / before
@@ -249,10 +254,11 @@ class CropModel:
 def detail_levels(edges: EdgeLikelihood, eye_dpt: Floats) -> tuple[Floats, Floats]:
     """Return mean frequency (cycles per sample) and level of the retina's detail of the first rings with detail."""
     edges(eye_dpt)
-    band, count = edges.band, edges.levels.size
+    band = edges.band
+    count = edges.levels.size
     sums = np.bincount(band.ring, np.hypot(band.rows, band.cols), count).astype(np.float64)
     frequency = sums / np.maximum(np.bincount(band.ring, minlength=count), 1)
-    is_known = edges.levels[:FITTED_RINGS] > LEAST_LEVEL * edges.levels[:FITTED_RINGS].max()
+    is_known = edges.levels[:FITTED_RINGS] > MIN_LEVEL * edges.levels[:FITTED_RINGS].max()
     return frequency[:FITTED_RINGS][is_known], edges.levels[:FITTED_RINGS][is_known]
 
 

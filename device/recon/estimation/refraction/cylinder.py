@@ -13,8 +13,8 @@ from device.recon.estimation.refraction.uncertainty import Quadratic, quadratic_
 CIRCLES_DPT = (0.7, 1.4)  # |J| of the first candidates
 AXES = 8
 STEPS_DPT = (0.5, 0.3)  # of descent and quadratic model, in this order
-MOST_DESCENTS = 6
-MOST_CYLINDER_DPT = 3.0  # |J|
+MAX_DESCENTS = 6
+MAX_CYLINDER_DPT = 3.0  # |J|
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def find_cylinder(edges: EdgeLikelihood, m_dpt: float, blocks: NDArray[np.int64]
             near = _Near(edges, lowest_dpt)  # the Hessian needs the linear model of the edge at its own place
         found = quadratic_model(near, lowest_dpt, step_dpt, blocks)
         eye_dpt = found.minimum
-        if not found.is_minimum or np.hypot(*eye_dpt[1:]) > MOST_CYLINDER_DPT:
+        if not found.is_minimum or np.hypot(*eye_dpt[1:]) > MAX_CYLINDER_DPT:
             return None
         edges.move_edge(edges(eye_dpt).step)
     return found
@@ -47,7 +47,8 @@ class _Near:
     """Likelihood of the eyes around one, with the linear model of the edge there, computed once for each eye."""
 
     def __init__(self, edges: EdgeLikelihood, eye_dpt: Floats) -> None:
-        self._edges, self._model = edges, edges.edge_model(eye_dpt)
+        self._edges = edges
+        self._model = edges.edge_model(eye_dpt)
         self._known: dict[tuple[float, ...], Candidate] = {}
 
     def __call__(self, eye_dpt: Floats) -> Candidate:
@@ -58,9 +59,9 @@ class _Near:
 
 
 def _descend(near: _Near, eye_dpt: Floats, step_dpt: float) -> Floats:
-    """Return the point downhill from an eye in steps along the three axes, at most MOST_DESCENTS of them."""
+    """Return the point downhill from an eye in steps along the three axes, at most MAX_DESCENTS of them."""
     steps = [sign * step_dpt * axis for axis in np.eye(eye_dpt.size) for sign in (-1, 1)]
-    for _ in range(MOST_DESCENTS):
+    for _ in range(MAX_DESCENTS):
         least, k = min((near(eye_dpt + step).nats, k) for k, step in enumerate(steps))
         if least >= near(eye_dpt).nats:
             break

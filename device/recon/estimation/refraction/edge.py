@@ -92,7 +92,8 @@ class EdgeLikelihood:
         self._flat_places = np.arange(self.band.where.size)
         self.levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
         self.noise = Noise(0.0, 1.0)
-        self._is_rounded, self.dithered_dn = False, 0.0
+        self._is_rounded = False
+        self.dithered_dn = 0.0
         self._noise_dn2 = 1.0
 
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
@@ -121,7 +122,8 @@ class EdgeLikelihood:
     def __call__(self, eye_dpt: Floats, most: int = PARAMETERS) -> Candidate:
         """Return the negative log likelihood of an eye, minimised over the first `most` parameters of the edge."""
         rest, otf, level = self._residual(eye_dpt)
-        nats, count = self._nats(rest, otf), min(most, self._count)
+        nats = self._nats(rest, otf)
+        count = min(most, self._count)
         return self._minimised(rest, otf, self._edge_model(level, count)) if count else self._candidate(nats)
 
     def edge_model(self, eye_dpt: Floats) -> EdgeModel | None:
@@ -137,7 +139,8 @@ class EdgeLikelihood:
 
     def _residual(self, eye_dpt: Floats) -> tuple[Spectrum, Spectrum, float]:
         """Return residual and OTF at the band's frequencies, (K,), and the scale of the smooth part."""
-        band, likelihood = self.band, self.likelihood
+        band = self.band
+        likelihood = self.likelihood
         stretch = transform(likelihood.geometry, *eye_dpt)
         level, _ = likelihood.residual_of(self.frame, stretch)
         rest = likelihood.fft.spectrum.ravel()[band.where]
@@ -186,7 +189,8 @@ class EdgeLikelihood:
 
     def move_edge(self, step: Floats) -> float:
         """Move the first parameters of the edge by `step` (samples), within their range; return the largest change."""
-        before, self.edge = self.edge, self.prior.moved(self.edge, step)
+        before = self.edge
+        self.edge = self.prior.moved(self.edge, step)
         return float(np.abs(self.edge.vector - before.vector).max())
 
     def field_edge(self, model: EdgeModel | None) -> FieldEdge:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.psf_warp import Wavefront, picture_otf, transform
-from device.recon.estimation.refraction.burst import LARGEST_STEP_DPT, LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
+from device.recon.estimation.refraction.burst import LARGEST_STEP_DPT, MAX_SCATTER_DPT, MIN_FRAMES, FrameScatter
 from device.recon.estimation.refraction.crop import CropRefinement
 from device.recon.estimation.refraction.cylinder import find_cylinder
 from device.recon.estimation.refraction.edge import EdgeLikelihood
@@ -40,19 +40,19 @@ SPAN_DPT = 9.0
 FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of a search over M
 COARSE_FRINGES = 0.3  # the same of the coarse search with the edge
 COARSE_PARAMETERS = 1  # of the edge in the coarse search: the radius
-LEAST_NATS = 100.0  # median minus minimum of the coarse search
-LEAST_FREQUENCIES = 500
+MIN_NATS = 100.0  # median minus minimum of the coarse search
+MIN_FREQUENCIES = 500
 SD_PER_MISSING_DPT = 0.4  # times the missing share: saturated frames of 11 eyes were off by 1.4 sd (rms) without it
 ROUNDS = 3  # of smooth part, search and edge; a gap needs them, since its filling biases M towards the PSF of the fit
-MOST_ROUNDS = 8  # while the edge moves
+MAX_ROUNDS = 8  # while the edge moves
 SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the rounds
-MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MOST_ROUNDS the edge was not found
+MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MAX_ROUNDS the edge was not found
 CURVATURE_STEP_DPT = 0.25
-MOST_SD_DPT = 1.5
-MOST_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
-MOST_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
+MAX_SD_DPT = 1.5
+MAX_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
+MAX_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
-LEAST_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains -0.02 to 0.15 dB, and as |J|^2
+MIN_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains -0.02 to 0.15 dB, and as |J|^2
 
 Floats = NDArray[np.float64]
 
@@ -73,8 +73,9 @@ class Cylinder:
         A picture loses in proportion to the squared error of (J0, J45), so that an estimate beyond 2 sd is expected to
         gain; but 14 % of the estimates of an eye without a cylinder are, and 1 % beyond 3 sd (Rayleigh distribution).
         """
-        size_dpt, sd_dpt = np.hypot(self.j0_dpt, self.j45_dpt), np.hypot(self.j0_sd_dpt, self.j45_sd_dpt) / 2**0.5
-        return bool(size_dpt < max(LEAST_CYLINDER_DPT, 3 * sd_dpt))
+        size_dpt = np.hypot(self.j0_dpt, self.j45_dpt)
+        sd_dpt = np.hypot(self.j0_sd_dpt, self.j45_sd_dpt) / 2**0.5
+        return bool(size_dpt < max(MIN_CYLINDER_DPT, 3 * sd_dpt))
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,8 @@ class RefractionEstimator:
         self.geometry = geometry
         self._calibration, self._shape, self._planner, self._index = calibration, shape, planner, index
         self._edges = EdgeLikelihood(calibration, geometry, shape, planner, index, edge_is_known)
-        taper, bands = self._edges.likelihood.taper, self._edges.likelihood.bands
+        taper = self._edges.likelihood.taper
+        bands = self._edges.likelihood.bands
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
         self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
@@ -163,8 +165,9 @@ class RefractionEstimator:
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None
     ) -> Refraction | NoRefraction:
         """Estimate M and the field edge of a frame (rows, cols) in counts; `defects` (flat indices) are left out."""
-        edges, relaxed = self._edges, np.zeros(1)
-        if edges.band.where.size < LEAST_FREQUENCIES:
+        edges = self._edges
+        relaxed = np.zeros(1)
+        if edges.band.where.size < MIN_FREQUENCIES:
             return NoRefraction("the PSF passes too few frequencies")
         frame = edges.start(counts, dark, defects)
         if not edges.fit_smooth(relaxed) > 0:
@@ -172,7 +175,7 @@ class RefractionEstimator:
         edges.set_noise(relaxed)
         coarse = Search(lambda m_dpt: edges(np.array([m_dpt]), COARSE_PARAMETERS).nats)
         m_dpt = coarse.grid_search(self.step_dpt * COARSE_FRINGES / FRINGES)
-        if coarse.depth_nats < LEAST_NATS:
+        if coarse.depth_nats < MIN_NATS:
             return NoRefraction("the frame does not show the structure of this PSF")
         m_dpt, moving_samples = self._alternate(m_dpt)
         if moving_samples > MOVING_SAMPLES or edges.prior.is_at_end(edges.edge):
@@ -183,8 +186,9 @@ class RefractionEstimator:
         if not model.is_minimum:
             return NoRefraction("the likelihood has no clear minimum")
         missing_dpt = SD_PER_MISSING_DPT * frame.missing
-        (m_dpt,), (sd_dpt,) = model.minimum, np.hypot(model.sds(self._spread), missing_dpt)
-        if sd_dpt > MOST_SD_DPT:
+        (m_dpt,) = model.minimum
+        (sd_dpt,) = np.hypot(model.sds(self._spread), missing_dpt)
+        if sd_dpt > MAX_SD_DPT:
             return NoRefraction(f"the standard deviation would be {sd_dpt:.1f} dpt")
         edge = edges.field_edge(edges.edge_model(model.minimum))
         curve = tuple(sorted(coarse.known.items()))
@@ -203,10 +207,10 @@ class RefractionEstimator:
         """Return the refraction of a burst whose first frame gave `found`, and the scatter between its frames.
 
         `frames` (rows, cols) in counts begin with the first one. The sd of M grows to the scatter, if that is larger.
-        `found` itself is returned if it has no refined cylinder, or for fewer than LEAST_FRAMES frames.
+        `found` itself is returned if it has no refined cylinder, or for fewer than MIN_FRAMES frames.
         """
         cylinder = found.cylinder
-        if cylinder is None or len(frames) < LEAST_FRAMES or not self._is_refined:
+        if cylinder is None or len(frames) < MIN_FRAMES or not self._is_refined:
             return found
         eye_dpt = np.array([found.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt])
         cleaned = [(counts, dark, self.defects(counts, dark)) for counts in frames]
@@ -217,7 +221,7 @@ class RefractionEstimator:
         if not np.abs(steps_dpt).max() < LARGEST_STEP_DPT:  # also for NaN
             return NoRefraction("a frame of the burst has another refraction than the first one")
         scatter = FrameScatter.of(steps_dpt[:, 0], found.sd_dpt)
-        if scatter.sd_dpt > MOST_SCATTER_DPT:
+        if scatter.sd_dpt > MAX_SCATTER_DPT:
             return NoRefraction(f"the refractions of the frames scatter by {scatter.sd_dpt:.1f} dpt")
         m_dpt, j0_dpt, j45_dpt = (eye_dpt + (steps_dpt - steps_dpt[0]).mean(axis=0)).tolist()
         return replace(
@@ -232,14 +236,14 @@ class RefractionEstimator:
     @property
     def _is_refined(self) -> bool:
         """True if the samples are fine enough for the refinement."""
-        return self._edges.grid.n * self.geometry.pitch_um <= MOST_SAMPLE_UM
+        return self._edges.grid.n * self.geometry.pitch_um <= MAX_SAMPLE_UM
 
     def _with_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
         model = find_cylinder(self._edges, found.sphere_dpt, self._blocks)
         if model is None:
             return NoRefraction("the likelihood has no clear minimum with a cylinder")
         sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
-        if sds_dpt.max() > MOST_SD_DPT:
+        if sds_dpt.max() > MAX_SD_DPT:
             return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
         eye_dpt = model.minimum
         if self._is_refined:
@@ -249,10 +253,12 @@ class RefractionEstimator:
             if not refined.is_explained:
                 return NoRefraction("no retina explains the frame with this PSF")
             distance = np.abs(refined.eye_dpt - eye_dpt) / np.hypot(sds_dpt, refined.sds_dpt)
-            if distance.max() > MOST_DISTANCE_SDS:
+            if distance.max() > MAX_DISTANCE_SDS:
                 return NoRefraction("the frame and its spectrum give different refractions")
-            eye_dpt, sds_dpt = refined.eye_dpt, np.hypot(refined.sds_dpt, (found.missing_sd_dpt, 0, 0))
-        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = eye_dpt.tolist(), sds_dpt.tolist()
+            eye_dpt = refined.eye_dpt
+            sds_dpt = np.hypot(refined.sds_dpt, (found.missing_sd_dpt, 0, 0))
+        (m_dpt, j0_dpt, j45_dpt) = eye_dpt.tolist()
+        (sd_dpt, j0_sd_dpt, j45_sd_dpt) = sds_dpt.tolist()
         return replace(
             found,
             sphere_dpt=m_dpt,
@@ -268,10 +274,11 @@ class RefractionEstimator:
         The second value is the last change of the edge in samples.
         """
         step_dpt = self.step_dpt / 2
-        for done in range(1, MOST_ROUNDS + 1):
+        for done in range(1, MAX_ROUNDS + 1):
             self._edges.fit_smooth(np.array([m_dpt]))
             fine = Search(self._near(m_dpt))
-            before_dpt, (m_dpt, _) = m_dpt, fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)
+            before_dpt = m_dpt
+            (m_dpt, _) = fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)
             change_samples = self._edges.move_edge(self._edges(np.array([m_dpt])).step)
             step_dpt = self.step_dpt / 4
             is_settled = change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT

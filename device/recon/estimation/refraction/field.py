@@ -13,14 +13,14 @@ from scipy import fft as scipy_fft
 from device.recon.estimation.shading import BLOCK, RIDGE, STRAY_RIDGE, blocks, zernike_modes
 from device.recon.model.fft_plans import Spectrum
 from device.recon.model.grid import Grid
-from device.recon.model.preprocessing import LEAST_GOOD, Linear
+from device.recon.model.preprocessing import MIN_GOOD, Linear
 from device.values import Image
 
 MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radius and of half the width
 FIRST_WIDTH_DEG = 0.4  # of the first model: a step has no derivative with respect to its width
 PRIOR_DEG = (0.5, 0.2, 0.2, 1.0)  # sqrt(2) sd of radius, centre (down, right) and width around the calibrated edge
 LARGEST_STEP_DEG = 0.3  # of one iteration: the linear model holds within the structure of the caustic
-LEAST_WEIGHT = 0.03  # of the brightest block, added for the read noise
+MIN_WEIGHT = 0.03  # of the brightest block, added for the read noise
 
 Floats = NDArray[np.float64]
 
@@ -88,14 +88,16 @@ class EdgePrior:
     """
 
     def __init__(self, field_deg: float, per_deg: float) -> None:
-        self._per_deg, self._reach = per_deg, MARGIN_DEG * per_deg
+        self._per_deg = per_deg
+        self._reach = MARGIN_DEG * per_deg
         self.calibrated = Edge(field_deg / 2 * per_deg, 0.0, 0.0, FIRST_WIDTH_DEG * per_deg)
         self.precision: Floats = (np.asarray(PRIOR_DEG) * per_deg) ** -2
         self.largest_samples = self.calibrated.radius_samples + self._reach
 
     def moved(self, edge: Edge, step: Floats) -> Edge:
         """Return an edge whose first parameters are moved by `step` (samples), within their range."""
-        wanted, largest = edge.vector, LARGEST_STEP_DEG * self._per_deg
+        wanted = edge.vector
+        largest = LARGEST_STEP_DEG * self._per_deg
         wanted[: step.size] += np.clip(step, -largest, largest)
         middle = self.calibrated.vector[:3]
         radius, down, right = np.clip(wanted[:3], middle - self._reach, middle + self._reach).tolist()
@@ -135,7 +137,8 @@ class LitField:
 
     def __init__(self, grid: Grid, calibrated: Edge, largest_samples: float) -> None:
         self._grid = grid
-        starts, sizes = [], []
+        starts = []
+        sizes = []
         for at, middle in zip(grid.at, grid.centre, strict=True):  # whole blocks, counted from the window's corner
             low = int(np.floor((middle - largest_samples - at) / BLOCK)) * BLOCK + at
             starts.append(low)
@@ -176,7 +179,8 @@ class LitField:
         Only the blocks that the edge crosses depend on it.
         """
         by_block = light.reshape(self._by_block.shape[1:])
-        least, most = by_block.min(axis=(1, 3)), by_block.max(axis=(1, 3))
+        least = by_block.min(axis=(1, 3))
+        most = by_block.max(axis=(1, 3))
         means = self._even_means * least
         down, right = np.nonzero(least != most)
         crossed = self._by_block[:, down, :, right, :] * by_block[down, :, right, :][:, None]
@@ -198,10 +202,10 @@ def _ridge_fit(frame: Linear, seen: Image) -> tuple[Floats, float]:
     brightest = float(seen[0].max())
     every = np.vstack([seen, np.full_like(seen[:1], brightest)])
     share = blocks(frame.good, BLOCK).ravel()
-    share[share < LEAST_GOOD] = 0
+    share[share < MIN_GOOD] = 0
     light = blocks(frame.y * frame.good, BLOCK).ravel()
     means = np.divide(light, share, out=np.zeros_like(light), where=share > 0)
-    weighted = every * (share / (np.maximum(seen[0], 0) / brightest + LEAST_WEIGHT))
+    weighted = every * (share / (np.maximum(seen[0], 0) / brightest + MIN_WEIGHT))
     normal = (weighted @ every.T).astype(np.float64)
     ridge = np.full(len(every), RIDGE)
     ridge[-1] = STRAY_RIDGE

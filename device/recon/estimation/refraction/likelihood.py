@@ -21,7 +21,7 @@ from device.recon.model.fft_plans import Planner, RealFft, Spectrum
 from device.recon.model.forward_model import dirichlet, taper, tight_model
 from device.recon.model.grid import Grid, Pair
 from device.recon.model.kernels import Pixels, Places
-from device.recon.model.preprocessing import LEAST_GOOD, Linear, Preprocessor
+from device.recon.model.preprocessing import MIN_GOOD, Linear, Preprocessor
 from device.values import Calibration, Geometry, Image, Mask
 
 SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
@@ -60,7 +60,8 @@ class Band:
         where = np.flatnonzero((frequency > low) & (frequency < high))
         edges = np.linspace(low, high, RINGS + 1)
         ring = np.clip(np.digitize(frequency.ravel()[where], edges) - 1, 0, RINGS - 1)
-        rows, cols = down[where // across.size], across[where % across.size]
+        rows = down[where // across.size]
+        cols = across[where % across.size]
         share = (dirichlet(rows, n) * dirichlet(cols, n)).astype(np.float32)
         scratch = (np.zeros(where.size, np.float32) for _ in range(2))
         return cls(where, ring, rows, cols, share, *scratch)
@@ -83,7 +84,8 @@ class SearchBands:
     @classmethod
     def of(cls, window: Pair, n: int, interpolated_otf: InterpolatedOtf) -> "SearchBands":
         """Select the frequencies for the stored PSF; `window` is (rows, cols) in samples of n x n pixels."""
-        rows, cols = np.fft.fftfreq(window[0])[:, None], np.fft.rfftfreq(window[1])[None]
+        rows = np.fft.fftfreq(window[0])[:, None]
+        cols = np.fft.rfftfreq(window[1])[None]
         frequency = np.hypot(rows, cols)
         power = np.abs(interpolated_otf.on_grid(window, n, np.eye(2)).astype(np.complex128)) ** 2
         low, high = band(frequency, power, min(window))
@@ -124,7 +126,8 @@ class RefractionLikelihood:
         index: int,
         sample_um: float = SAMPLE_UM,
     ) -> None:
-        self.geometry, self.sensor = geometry, calibration.sensor
+        self.geometry = geometry
+        self.sensor = calibration.sensor
         self.interpolated_otf = InterpolatedOtf(calibration.psfs[index])
         n = max(1, min(round(sample_um / geometry.pitch_um), min(shape) // 16))
         self.model = tight_model(calibration, shape, n, planner, index)
@@ -157,7 +160,7 @@ class RefractionLikelihood:
         frame = self._preparer(counts, dark, defects)
         self._gaps = GapTreatment(self.taper)
         if frame.has_gaps:
-            gap = frame.good < LEAST_GOOD
+            gap = frame.good < MIN_GOOD
             wide = ndimage.binary_opening(gap, np.ones((WIDE_SAMPLES, WIDE_SAMPLES), np.bool_))
             near = np.minimum(1, ndimage.distance_transform_edt(~wide) / RAMP_SAMPLES) if wide.any() else 1.0
             weights = (self.taper * (0.5 - 0.5 * np.cos(np.pi * near))).astype(np.float32)
@@ -199,7 +202,7 @@ class RefractionLikelihood:
         attributed to the retina.
         """
         smooth = self.model.blur(self._smooth)[self.grid.slices] + np.float32(stray)
-        known = (frame.good >= LEAST_GOOD).astype(np.float32)
+        known = (frame.good >= MIN_GOOD).astype(np.float32)
         detail = ndimage.gaussian_filter((frame.y - smooth) * known, FADE_SAMPLES)
         share = ndimage.gaussian_filter(known, FADE_SAMPLES)
         filling = (narrow * self._gaps.weights * detail / np.maximum(share, 0.1)).astype(np.float32)

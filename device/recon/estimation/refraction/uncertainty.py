@@ -65,11 +65,13 @@ def quadratic_model(
     size = at.size
     nats = value(at).nats
     unit = np.eye(size) * step
-    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    hessian = np.zeros((size, size))
+    gradient = np.zeros(size)
     slopes = np.zeros((SECTORS * RING_GROUPS, size))
     above = np.zeros(size)
     for k in range(size):
-        low, high = value(at - unit[k]), value(at + unit[k])
+        low = value(at - unit[k])
+        high = value(at + unit[k])
         above[k] = high.nats
         gradient[k] = (high.nats - low.nats) / (2 * step)
         hessian[k, k] = (high.nats - 2 * nats + low.nats) / step**2
