@@ -25,12 +25,13 @@ from device.recon.white_balance import balanced, white_ratios
 from device.values import ChannelUse, Colour, Geometry, Image, Reconstruction, Report
 
 NO_PSF = "the calibration has no PSF in this colour of light"
+NO_PSF_CODE = "colour.psf"
 NOT_REGISTERED = "{} could not be registered: no shift matches better than chance. It is shown where it was taken."
 
 
 def without_psf(colour: Colour) -> ChannelUse:
     """Return the entry of a report for a colour of which the calibration has no PSF."""
-    return ChannelUse(colour, None, reason=NO_PSF, code="colour.psf")
+    return ChannelUse(colour, None, reason=NO_PSF, code=NO_PSF_CODE)
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def test_refused_request_shows_server_message(open_page: Open, real: Real, compl
         expect(page.locator(".state")).to_have_attribute("data-state", "busy")
         page.locator(SHUTTER).tap(force=True)
         bar = page.get_by_role("status")
-        expect(bar).to_contain_text("a picture is being taken")
+        expect(bar).to_contain_text("A picture is being taken")
         expect(bar).to_contain_text("Wait until it is done, then press again.")
         real.hold = None
         made.result(30)

@@ -7,10 +7,11 @@ from typing import get_args
 from device.errors import DiffuscopeError
 from device.recon.assessment.aiming import AimCode
 from device.recon.assessment.frame_quality import Code as VerdictCode
+from device.recon.colour_reconstructor import NO_PSF_CODE
 from services.health.alerts import AlertCode
 from services.http.problem_responses import HTTP_STATUS
 from services.records.protocol import Reason
-from services.records.visit import OutcomeCode
+from services.records.visit import GREEN_ONLY, OutcomeCode
 from tests.project_files import files, text
 
 PAGE_CODES = {
@@ -58,7 +59,7 @@ def page_codes() -> set[str]:
 
 
 def test_every_code_of_the_page_exists_on_the_server_or_is_its_own() -> None:
-    server = {*errors(), *get_args(AlertCode), *get_args(VerdictCode)}
+    server = {*errors(), *get_args(AlertCode), *get_args(VerdictCode), GREEN_ONLY, NO_PSF_CODE}
     assert page_codes() - server == set(PAGE_CODES)
 
 
