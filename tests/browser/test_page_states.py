@@ -238,7 +238,9 @@ def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: 
     tap(page, "#could-not")
     expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")
     expect(page.locator("eye-live")).to_have_css("visibility", "hidden")
-    page.locator("#not-asked").tap()
+    with page.expect_response("**/api/preview?*"):  # the server's last frame, which is old
+        page.locator("#not-asked").tap()
+    page.wait_for_timeout(300)  # to decode it
     expect(page.locator("eye-live[data-frame]")).to_have_count(0)
     real.clock.gate.set()
     wait_for_preview(page)

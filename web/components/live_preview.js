@@ -29,6 +29,7 @@ export class LivePreview extends HTMLElement {
   /** @type {{code: string} | null} */
   #hint = null; // aiming hint
   #reported = { frame_s: 0, link_s: 0 };
+  #clearedMs = -Infinity; // frames from before this moment are not shown
   #abort = new AbortController();
   #canvas = document.createElement("canvas");
   #age = document.createElement("p");
@@ -99,6 +100,7 @@ export class LivePreview extends HTMLElement {
   }
 
   #clearFrame() {
+    this.#clearedMs = performance.now();
     this.#bitmap?.close();
     this.#bitmap = null;
     this.#empty.hidden = false;
@@ -123,10 +125,12 @@ export class LivePreview extends HTMLElement {
       if (!frame) this.#number = 0; // a restarted server counts from the beginning
       if (abort.signal.aborted) return frame?.bitmap.close(); // of the other eye, or of a dead connection
       if (!frame || !this.#active) return;
+      this.#number = frame.number;
+      const takenMs = performance.now() - frame.ageMs;
+      if (takenMs < this.#clearedMs) return frame.bitmap.close(); // the server's last one, from before aiming
       this.#bitmap?.close();
       this.#bitmap = frame.bitmap;
-      this.#number = frame.number;
-      this.#takenMs = performance.now() - frame.ageMs;
+      this.#takenMs = takenMs;
       this.dataset.frame = String(frame.number);
       this.#empty.hidden = true;
       this.#draw();

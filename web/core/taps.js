@@ -19,7 +19,8 @@ function isRepetition(name, { x, y, ms }, mayRepeat = false) {
   const before = last.get(name);
   last.set(name, { x, y, ms });
   if (!before || Math.hypot(x - before.x, y - before.y) > SAME_PLACE_PX) return false;
-  return ms - (mayRepeat ? changedMs : Math.max(before.ms, changedMs)) < DEBOUNCE_MS;
+  const sinceMs = mayRepeat ? (before.ms < changedMs ? changedMs : -Infinity) : Math.max(before.ms, changedMs);
+  return ms - sinceMs < DEBOUNCE_MS;
 }
 
 /** Return whether a key press may act. */
