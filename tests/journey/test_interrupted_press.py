@@ -17,6 +17,7 @@ from device.values import ExposureSettings, Frame, Illumination
 from services.errors import ConsentDeclined
 from services.instrument.capture_pipeline import INTERRUPTED
 from services.instrument.resumption import CALIBRATION_DARK, NO_DARK, SHORTER, WHOLE
+from services.records import digested_json
 from services.records.capture_journal import MAX_ATTEMPTS
 from services.records.capture_target import CaptureTarget
 from services.records.protocol import load_protocol
@@ -48,9 +49,18 @@ class EndsAt:
 
 
 def written(store: Path) -> dict[str, bytes]:
-    """Return the frames of the press in progress that count: those with a note."""
+    """Return the frames of the press in progress that count: those with a whole note."""
     notes = sorted(store.glob("journal/*/*.tiff.json"))
-    return {note.stem: note.with_name(note.stem).read_bytes() for note in notes}
+    return {note.stem: note.with_name(note.stem).read_bytes() for note in notes if is_whole(note)}
+
+
+def is_whole(note: Path) -> bool:
+    """Whether a note has its content: a kill may come between its creation and that."""
+    try:
+        digested_json.decoded(note.read_bytes())
+    except ValueError:
+        return False
+    return True
 
 
 def begin_visit(rig: Rig) -> str:
@@ -229,7 +239,7 @@ def killed_press(server: Server, process: subprocess.Popen[bytes], data: Path, k
     request = {"eye": "OD", "key": key}
     with ThreadPoolExecutor(1) as aside:
         pressed = aside.submit(server.ask, "POST", "/api/captures", request)
-        until(lambda: bool(list(data.glob(f"journal/*/{last}.json"))) or pressed.done(), 300)
+        until(lambda: any(map(is_whole, data.glob(f"journal/*/{last}.json"))) or pressed.done(), 300)
         process.send_signal(signal.SIGKILL)
         assert pressed.exception(60) is not None, "the kill came too late, so the test shows nothing"
     process.wait()
