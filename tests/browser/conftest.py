@@ -233,6 +233,8 @@ def open_page(browser: Browser, complaints: Complaints, undo: ExitStack) -> Iter
     yield opened
     unexpected = complaints.unexpected()
     for context in contexts:
+        for page in context.pages:
+            page.goto("about:blank")  # the page sends its release of the camera, which a closed context would not
         context.close()
     assert unexpected == []
 

@@ -20,6 +20,7 @@ from tests.browser.walk import (
     tap,
     visit_of,
     wait_for_preview,
+    wait_for_release,
 )
 from tests.journey.conftest import DAY_S, until
 
@@ -293,8 +294,7 @@ def test_fast_tapping_on_real_server(open_page: Open, server: Server, complaints
     page = open_page(server.url)
     page.set_default_timeout(60_000)
     page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
-    if after_debounce(page).locator("[data-do=useHere]").count():
-        page.locator("[data-do=useHere]").tap()
+    wait_for_release(page)
     new_person(page)
     for _ in range(12):  # a busy computer may cut the light: the slot is then requested again
         tap(page, f"{SHUTTER}[aria-disabled=false]")

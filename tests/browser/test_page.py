@@ -21,6 +21,7 @@ from tests.browser.walk import (
     new_person,
     tap,
     wait_for_preview,
+    wait_for_release,
 )
 
 pytestmark = pytest.mark.browser
@@ -34,15 +35,13 @@ def live_after(page: Page, number: int, limit_s: float = 5) -> None:
 
 
 def a_new_person(page: Page, complaints: Complaints) -> Page:
-    """Aim at the first slot of a new patient, on a server that may be starting or controlled by another page."""
+    """Aim at the first slot of a new patient, on a server that may be starting or whose last page has just closed."""
     complaints.expect("404")
     page.wait_for_selector("#new")
     if page.evaluate("fetch('/api/protocol').then((answer) => answer.status)") != 200:
         pytest.skip("this server keeps no visits")
     page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
-    if after_debounce(page).locator("[data-do=useHere]").count():
-        page.locator("[data-do=useHere]").tap()
-        expect(page.locator(".state-bar")).to_have_count(0)
+    wait_for_release(page)
     new_person(page)
     return page
 

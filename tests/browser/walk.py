@@ -3,10 +3,12 @@
 import re
 import time
 from collections.abc import Callable
+from urllib.parse import urljoin
 
 from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.real import Real
+from tests.journey.conftest import until
 
 SHUTTER = "#shutter"
 DEBOUNCE_MS = 450  # debounce time of the page (400 ms) and a margin
@@ -17,6 +19,11 @@ def wait_for_preview(page: Page) -> int:
     """Wait for a live frame; return its number."""
     page.wait_for_selector("eye-live[data-frame]")
     return int(page.locator("eye-live").get_attribute("data-frame") or 0)
+
+
+def wait_for_release(page: Page) -> None:
+    """Wait until no screen holds the camera: the page of another test lets go of it 2 s after it has closed."""
+    until(lambda: page.request.get(urljoin(page.url, "/api/status")).json()["controller"] is None)
 
 
 def after_debounce(page: Page) -> Page:
