@@ -214,12 +214,15 @@ def without_band(light: Image) -> Image:
     return left
 
 
-def with_band(pixels: Pixels, text: str, ratio: float, *, at_right: bool = False) -> Pixels:
-    """Return a copy of the pixels with `text` in a bottom corner; `ratio`: letter size over the picture's height."""
+def with_band(pixels: Pixels, text: str, ratio: float, *, top_right: bool = False) -> Pixels:
+    """Return a copy of the pixels with `text` in the bottom left corner, or in the opposite one.
+
+    `ratio`: letter size over the picture's height.
+    """
     band = _band(*pixels.shape[:2], text, ratio)
     rows, cols = band.shape
     marked = pixels.copy()
-    corner = marked[-rows:, -cols:] if at_right else marked[-rows:, :cols]
+    corner = marked[:rows, -cols:] if top_right else marked[-rows:, :cols]
     corner[...] = band if pixels.ndim == 2 else band[..., np.newaxis]
     return marked
 

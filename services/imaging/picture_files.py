@@ -47,15 +47,15 @@ def to_png(
 
     `picture` is linear float32 (rows, cols) or (rows, cols, 3) and keeps its size; all channels share one window, which
     preserves neutral colours. A simulated picture carries a mark in its pixels and the text chunk `simulated`; `note`
-    becomes a text chunk. So do `predicted` channels, which were not measured: mark in the bottom right corner and text
-    chunk `predicted`. Raises FrameError if any value is NaN or infinite.
+    becomes a text chunk. So do `predicted` channels, which were not measured: mark in the top right corner, which the
+    other mark never reaches, and text chunk `predicted`. Raises FrameError if any value is NaN or infinite.
     """
     _refuse_invalid_picture(picture)
     pixels = _display_pixels(picture, window)
     texts = {}
     if predicted:
         texts = {_PREDICTED_TEXT: ", ".join(predicted)}
-        pixels = with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, at_right=True)
+        pixels = with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, top_right=True)
     return png_bytes(pixels, simulated, texts, note)
 
 

@@ -77,6 +77,15 @@ def test_the_mark_has_nine_separate_letters_in_one_corner_and_nothing_else_chang
     assert (plain[:, right + edge :] == marked[:, right + edge :]).all()
 
 
+@pytest.mark.parametrize("shape", [(270, 270, 3), (270, 480, 3), (480, 200, 3)], ids=str)
+def test_the_marks_of_simulated_and_of_predicted_channels_are_both_whole(shape: tuple[int, ...]) -> None:
+    blank, predicted = np.zeros(shape, np.float32), ("red", "blue")
+    alone = pixels_of(to_png(blank, simulated=False, predicted=predicted))
+    both = pixels_of(to_png(blank, simulated=True, predicted=predicted))
+    assert alone.max() > 200
+    assert (both == np.maximum(alone, pixels_of(to_png(blank, simulated=True)))).all()
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (3, 500), (8, 8), (500, 3), (20, 30, 3)])
 def test_the_smallest_pictures_are_drawn_and_marked(shape: tuple[int, ...]) -> None:
     picture = np.full(shape, 7, np.float32)
