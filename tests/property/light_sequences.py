@@ -474,7 +474,7 @@ def doses_j_per_cm2(frames: int, colours: tuple[Colour, ...]) -> float:
     clock = VirtualClock()
     with TemporaryDirectory() as folder:
         file = Path(folder) / "head.toml"
-        file.write_text(small_head_toml("small"))
+        file.write_text(small_head_toml("small").replace("[light]", f"[light]\nmax_on_s = {MAX_ON_S}"))  # real time
         head = open_head(load_head(file), clock, MemoryLedger(clock))
     try:
         expose(head, ("OD",), clock, in_visit=True, count=frames, colours=colours)
