@@ -4,7 +4,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 import numpy as np
@@ -14,11 +14,11 @@ from device.recon.assessment.aiming import Aim
 from device.recon.assessment.exposure_split import ExposureSplit
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
-from device.recon.burst_reconstructor import PreparedFrame
-from device.values import EYES, ChannelUse, Colour, Eye, Frame, Image, Report
+from device.values import EYES, Colour, Eye, Frame, Image, Report
 from services.imaging import picture_files
 from services.imaging.colour_rendering import render_colour
 from services.imaging.raw_metadata import RawMetadata
+from services.instrument.press_exposure import Exposure
 from services.records.blobs import FileContent, WrittenFile
 from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, PictureVerdict
 from services.records.capture_journal import InterruptedCapture
@@ -74,35 +74,25 @@ class Press:
 
 @dataclass(frozen=True)
 class ExposedCapture:
-    """Exposed capture: the lit frames and the dark frame of a press, before reconstruction.
+    """Capture before its reconstruction: the press, its exposure with the first verdict, on `frame`, and dose report.
 
-    `dark`: None if its file was not on the disk. `expose_s`: duration of all exposures. `light`: dose report.
-    `verdict`: first verdict, on `frame`. `unusable`: reason of each frame that must not enter the picture, by its
-    index. `colours`: one frame in each other colour of light; `missing`: each that was not taken, with the reason.
     `written` waits for the frames that are being written to the disk, and returns their files by the number of the
-    frame. `notes`: warnings on the exposure for the report. `prepared`: what was prepared of the frames during the
-    exposure, by their index.
+    frame. `notes`: warnings on the exposure for the report.
     """
 
     press: Press
     id: str
     taken_at: datetime
-    frames: tuple[Frame, ...]
-    dark: Frame | None
-    expose_s: float
+    exposure: Exposure
     light: DoseReport
     verdict: Verdict
-    unusable: Mapping[int, str] = field(default_factory=dict)
-    colours: Mapping[Colour, Frame] = field(default_factory=dict)
-    missing: tuple[ChannelUse, ...] = ()
     written: Callable[[], Mapping[int, WrittenFile]] = dict
     notes: tuple[str, ...] = ()
-    prepared: Mapping[int, PreparedFrame] = field(default_factory=dict)
 
     @property
     def frame(self) -> Frame:
         """The first lit frame: the reference of the burst, and the quick look."""
-        return self.frames[0]
+        return self.exposure.lit[0]
 
 
 def split_notes(split: ExposureSplit) -> tuple[str, ...]:
@@ -187,9 +177,10 @@ def capture_files(
 
 def _frame_files(capture: Capture, head: str, shot: ExposedCapture) -> dict[str, FileContent]:
     """Return the raw frames of a capture by file name: the file that is on the disk already, or its content."""
-    frames = {lit_name(k): one for k, one in enumerate(shot.frames)}
-    frames |= {colour_name(colour): one for colour, one in shot.colours.items()}
-    frames |= {} if shot.dark is None else {DARK: shot.dark}
+    exposure = shot.exposure
+    frames = {lit_name(k): one for k, one in enumerate(exposure.lit)}
+    frames |= {colour_name(colour): one for colour, one in exposure.colours.items()}
+    frames |= {} if exposure.dark is None else {DARK: exposure.dark}
     written = shot.written()
     shared = RawMetadata(capture.id, capture.eye, capture.taken_at, calibration_id=capture.calibration_id, head=head)
 
@@ -210,7 +201,9 @@ def capture_report(
     budget in seconds.
     """
     report = CaptureReport(
-        replace(made, seconds={"expose": shot.expose_s, **made.seconds}, warnings=(*made.warnings, *shot.notes)),
+        replace(
+            made, seconds={"expose": shot.exposure.duration_s, **made.seconds}, warnings=(*made.warnings, *shot.notes)
+        ),
         shot.light,
         shot.press.target.visit,
         shot.press.target.slot,

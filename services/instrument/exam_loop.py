@@ -24,7 +24,7 @@ from services.imaging.raw_metadata import RawMetadata
 from services.instrument.background import run_in_thread
 from services.instrument.calibration_monitor import CalibrationMonitor
 from services.instrument.capture import ExposedCapture, Press, split_notes
-from services.instrument.capture_pipeline import CapturePipeline, Exposure, prepared_frames
+from services.instrument.capture_pipeline import CapturePipeline
 from services.instrument.exam_events import ExamEvents
 from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import ExamEvent
@@ -32,6 +32,7 @@ from services.instrument.frame_feedback import FAILED_VERDICT
 from services.instrument.frame_sink import FrameSink
 from services.instrument.live_pictures import LivePictures
 from services.instrument.press_colours import colours_of_lamp
+from services.instrument.press_exposure import Exposure
 from services.instrument.resumption import ResumedPress, resumed_frames
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
@@ -78,7 +79,7 @@ class ExamLoop:
         self._events = parts.events
         self._pipeline = pipeline
         self._live = LivePictures(
-            parts.head.light, parts.clock, pipeline, parts.requests, parts.events, parts.store.refuse_light_in_vain
+            parts.head, parts.clock, pipeline, parts.requests, parts.events, parts.store.refuse_light_in_vain
         )
         self._exposed: deque[ExposedCapture] = deque()
         self._resumed = deque(parts.resumed)
@@ -126,13 +127,13 @@ class ExamLoop:
         taken_at = self._parts.clock.wall()
         id = Capture.new_id(taken_at, press.eye, secrets.token_hex(3))
         with self._resolving(press, id, ExamEvent.EXPOSURE_FAILED):
-            self._exposed.append(self._expose(press, id, taken_at))
+            self._exposed.append(self._take(press, id, taken_at))
             # Before the `off` at the exit of this context: if that fails during a refinement, this capture is exposed
             # and waits all the same, and the error fails only the capture whose refinement is suspended.
             self._requests.advance(ExamEvent.EXPOSED)
         self._events.state()
 
-    def _expose(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
+    def _take(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
         head = self._parts.head
         target = press.target
         target.permit()  # again: the consent may have been withdrawn while the press waited
@@ -161,21 +162,7 @@ class ExamLoop:
         exposure, verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)
         light = replace(self._parts.head.light.dose_report(), dose_j_per_cm2=exposure.dose_j_per_cm2)
-        return ExposedCapture(
-            press,
-            id,
-            taken_at,
-            exposure.lit,
-            exposure.dark,
-            exposure.duration_s,
-            light,
-            verdict,
-            exposure.unusable,
-            exposure.colours,
-            exposure.missing,
-            notes=split_notes(exposure.split),
-            prepared=prepared_frames(exposure),
-        )
+        return ExposedCapture(press, id, taken_at, exposure, light, verdict, notes=split_notes(exposure.split))
 
     def _resume_oldest(self) -> None:
         """Queue the oldest press of the run before for reconstruction, with the frames that are on the disk."""

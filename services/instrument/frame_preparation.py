@@ -5,13 +5,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol
 
 from device.errors import FrameError
 from device.recon.assessment.frame_quality import Verdict
-from device.recon.burst_reconstructor import PreparedFrame
-from device.recon.model.kernels import Pixels
+from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
 from device.values import Colour, Counts, Frame, Image
+from services.instrument.frame_feedback import FrameAssessor
 
 Looked = Callable[[Image, bool], None]  # with the quick look of the first useful frame, and whether it is simulated
 
@@ -28,32 +27,23 @@ class AssessedFrame:
     prepared: PreparedFrame | None
 
 
-class Assessor(Protocol):
-    """Assessment of raw frames, as `FrameAssessor` does it."""
-
-    def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
-        """Return the verdict on a raw frame."""
-
-
-class Preparer(Protocol):
-    """Preparation of frames, as `device.recon.burst_reconstructor.BurstReconstructor` does it."""
-
-    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
-        """Return a frame with its quick look, and `refract` it in a thread; FrameError for a useless one."""
-
-
 class FramePreparation:
     """Preparation of the frames of one press in a thread of its own; a context, at whose exit the thread has ended.
 
-    The thread of the press calls the methods. Until `finish` it must not use `assessor`, `preparer` and what `looked`
+    The thread of the press calls the methods. Until `finish` it must not use `assessor`, `bursts` and what `looked`
     uses: the thread of the preparation does. Only frames in the light of the burst, `colour`, are prepared. `begin_s`:
     begin of the press (clock seconds). `looked` is called once, with the quick look of the first useful frame.
 
     A prepared frame holds 8 bytes per pixel: 8 frames of 2 MP, the most of a press, take 135 MB.
     """
 
-    def __init__(self, assessor: Assessor, preparer: Preparer, colour: Colour, begin_s: float, looked: Looked) -> None:
-        self._assessor, self._preparer, self._colour, self._begin_s = assessor, preparer, colour, begin_s
+    def __init__(
+        self, assessor: FrameAssessor, bursts: BurstReconstructor, colour: Colour, begin_s: float, looked: Looked
+    ) -> None:
+        self._assessor = assessor
+        self._bursts = bursts
+        self._colour = colour
+        self._begin_s = begin_s
         self._looked: Looked | None = looked
         self._executor = ThreadPoolExecutor(1, "preparation")
         self._dark: Counts | None = None
@@ -81,7 +71,7 @@ class FramePreparation:
     def _prepare(self, frame: Frame) -> AssessedFrame:
         prepared = None
         with suppress(FrameError):  # its verdict says why
-            prepared = self._preparer.prepare(frame.counts, self._dark, refract=self._looked is not None)
+            prepared = self._bursts.prepare(frame.counts, self._dark, refract=self._looked is not None)
         if prepared is not None and self._looked is not None:
             self._looked(prepared.look.picture, frame.simulated)
             self._looked = None

@@ -4,11 +4,12 @@ from collections.abc import Callable
 
 from device.clock import Clock
 from device.errors import DiffuscopeError
-from device.light_safety.guard import GuardedLight
+from device.head import Head
 from services.errors import RequestRefused
-from services.instrument.capture_pipeline import CapturePipeline, LiveFrame
+from services.instrument.capture_pipeline import CapturePipeline
 from services.instrument.exam_events import ExamEvents
 from services.instrument.exam_requests import ExamRequests
+from services.instrument.press_exposure import LiveFrame, expose_live
 
 RETRY_S = 1.0
 
@@ -21,15 +22,19 @@ class LivePictures:
 
     def __init__(
         self,
-        light: GuardedLight,
+        head: Head,
         clock: Clock,
         pipeline: CapturePipeline,
         requests: ExamRequests,
         events: ExamEvents,
         refuse_in_vain: Callable[[], None],
     ) -> None:
-        self._light, self._clock, self._pipeline = light, clock, pipeline
-        self._requests, self._events, self._refuse_in_vain = requests, events, refuse_in_vain
+        self._head = head
+        self._clock = clock
+        self._pipeline = pipeline
+        self._requests = requests
+        self._events = events
+        self._refuse_in_vain = refuse_in_vain
 
     @property
     def are_wanted(self) -> bool:
@@ -45,7 +50,7 @@ class LivePictures:
             if (seen := self._take()) is None:
                 return
         except DiffuscopeError as error:
-            self._light.off()
+            self._head.light.off()
             self._events.problem(error)
             self._pause(RETRY_S)
             return
@@ -60,7 +65,7 @@ class LivePictures:
             self._requests.withdraw(wanted)
             return None
         self._refuse_in_vain()
-        seen = self._pipeline.expose_live(wanted.eyes, in_visit=wanted.visit is not None)
+        seen = expose_live(self._head, wanted.eyes, self._clock, in_visit=wanted.visit is not None)
         if self._requests.snapshot.state.has_press:
             return None
         jpeg, aim = self._pipeline.live_picture(seen)

@@ -11,7 +11,7 @@ from device.values import Calibration, Colour, Frame
 from services.errors import RecordNotFound
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.capture import Press
-from services.instrument.capture_pipeline import Exposure
+from services.instrument.press_exposure import Exposure
 from services.records.blobs import WrittenFile
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal, ResumableCapture

@@ -92,7 +92,7 @@ def record() -> dict[str, Any]:
     from device.clock import SystemClock
     from device.head import head_memory
     from device.values import EYES, HeadIdentity
-    from services.instrument.capture_pipeline import expose, expose_live
+    from services.instrument.press_exposure import expose_live, expose_press
     from tests.ports.emulators.wires import emulated_buses
     from tests.ports.test_press import attach_sensor, head_with_real_drivers, reopened_head
 
@@ -106,7 +106,7 @@ def record() -> dict[str, Any]:
     with listener.phase("aim"):
         expose_live(head, EYES, clock)
     with listener.phase("press"):
-        expose(head, ("OD",), clock)
+        expose_press(head, ("OD",), clock)
     with listener.phase("close"):
         head.close()
     with listener.phase("write the head's memory"), head_memory(head_with_real_drivers(), clock) as memory:

@@ -24,7 +24,7 @@ GUARD, LEDGER, BOOK, COPY = (
     "services/records/dose_ledger_tables.py",
     "services/records/dose_ledger_log.py",
 )
-STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
+STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE, PRESS = (
     "services/records/capture_store.py",
     "services/records/quarantine.py",
     "services/instrument/exam.py",
@@ -33,6 +33,7 @@ STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
     "services/instrument/exam_loop.py",
     "services/instrument/live_pictures.py",
     "services/instrument/capture_pipeline.py",
+    "services/instrument/press_exposure.py",
 )
 SIGNING, RECOVERY = "services/records/record_signing.py", "services/records/recovery.py"
 JOURNAL, WRITER = "services/records/capture_journal.py", "services/records/frame_writer.py"
@@ -188,8 +189,8 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ),
     (
         "services/instrument/capture_pipeline.py",
-        "shot.frame.simulated, deadline\n",
-        "False, deadline\n",
+        "simulated = shot.frame.simulated\n",
+        "simulated = False\n",
         "files_of_a_capture",
     ),
     (
@@ -423,13 +424,13 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(REQUESTS, "            self._live_request = wanted\n", "", "tests/journey/test_consent.py"),
     Mutant(
-        PIPELINE,
-        "    head.check()\n    run, part = _Exposing(",
-        "    run, part = _Exposing(",
+        PRESS,
+        "    head.check()\n    run = _Exposing(",
+        "    run = _Exposing(",
         scenario("head_lost"),
     ),
     Mutant(
-        PIPELINE,
+        PRESS,
         "head.light.on(Illumination(head.spec.light.preview_colour), eyes",
         "head.light.on(Illumination(head.spec.light.colour), eyes",
         scenario("press_while_aiming"),

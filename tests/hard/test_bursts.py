@@ -25,7 +25,8 @@ from device.recon.reconstructor import Reconstructor
 from device.sim.objects import moved_behind_field
 from device.sim.render import crop_or_pad
 from device.values import Counts, Image, Reconstruction
-from services.instrument.capture_pipeline import expose, plan_pipeline
+from services.instrument.capture_pipeline import plan_pipeline
+from services.instrument.press_exposure import expose_press
 from tests import scenes
 from tests.moving_retina import (
     BLACK_DN,
@@ -164,7 +165,7 @@ def test_a_split_press_of_a_moving_simulated_eye_is_nearer_to_the_truth(tmp_path
         for speed in (None, SPEED_DEG_PER_S):
             split = choose_split(4, spec.camera.exposure_s, speed, PressLight(200 / spec.camera.exposure_s, 0.0))
             clock.sleep(60)  # the guard asks for darkness
-            press = expose(head, ("OD",), clock, count=4, split=split)
+            press = expose_press(head, ("OD",), clock, count=4, split=split)
             *_, made = pipeline.bursts.steps([one.counts for one in press.lit], simulated=True)
             assert isinstance(made, Reconstruction)
             assert all(one.used for one in made.report.frames)

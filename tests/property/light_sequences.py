@@ -34,7 +34,7 @@ from device.light_safety.guard import AFTERGLOW_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
 from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.values import EYES, Calibration, Colour, ExposureSettings, Eye, Frame, Illumination, Psf, Sensor
-from services.instrument.capture_pipeline import expose, expose_live
+from services.instrument.press_exposure import expose_live, expose_press
 from services.records import schema
 from services.records.dose_ledger_tables import DoseLedgerStore
 from tests.simulated import small_head_toml
@@ -361,7 +361,9 @@ class Eyes(RuleBasedStateMachine):
         head = self.head(TimedCamera(self, slow, kill_at), exposure_s)
         try:
             with self.lamp_is_off_after_a_refusal():
-                made = expose(head, (eye,), self.times, in_visit=in_visit, count=count, colours=colours, split=split)
+                made = expose_press(
+                    head, (eye,), self.times, in_visit=in_visit, count=count, colours=colours, split=split
+                )
                 assert not self.disk.full, "light without a record"
                 assert sum(one.exposure_s for one in made.lit) <= count * exposure_s * (1 + 1e-9)
                 self.tally["split press"] += parts > 1
@@ -477,7 +479,7 @@ def doses_j_per_cm2(frames: int, colours: tuple[Colour, ...]) -> float:
         file.write_text(small_head_toml("small").replace("[light]", f"[light]\nmax_on_s = {MAX_ON_S}"))  # real time
         head = open_head(load_head(file), clock, MemoryLedger(clock))
     try:
-        expose(head, ("OD",), clock, in_visit=True, count=frames, colours=colours)
+        expose_press(head, ("OD",), clock, in_visit=True, count=frames, colours=colours)
         return head.light.ledger.spent_j_per_cm2("OD")
     finally:
         head.close()

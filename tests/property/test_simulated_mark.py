@@ -44,6 +44,7 @@ from services.imaging.raw_metadata import RawMetadata
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
 from services.instrument.camera_tap import CameraTap
 from services.instrument.capture import ExposedCapture, Press, capture_files
+from services.instrument.press_exposure import Exposure
 from services.instrument.visit_montage import join_pictures
 from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_target import CaptureTarget
@@ -349,7 +350,9 @@ def test_encoded_files_of_a_capture(simulated: bool) -> None:
     at, picture = VirtualClock().wall(), np.random.default_rng(0).uniform(0, 1, (90, 120)).astype(np.float32)
     exposed = Frame(np.full((90, 120), 500, np.uint16), 0.1, 1, Illumination("green"), simulated)
     press = Press(Future(), "OD", CaptureTarget(), None)
-    shot = ExposedCapture(press, "a", at, (exposed,), None, 0.2, DoseReport(), Verdict("good", None, {}))
+    shot = ExposedCapture(
+        press, "a", at, Exposure((exposed,), {}, None, 0.0, 0.2, 0.0), DoseReport(), Verdict("good", None, {})
+    )
     capture = Capture("a", "OD", at, simulated, "c", CaptureReport(Report("tikhonov"), light=DoseReport()), {})
     files = capture_files(capture, "head", shot, picture, np.stack([picture] * 3, axis=2))
     for name, content in files.items():

@@ -26,7 +26,8 @@ from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import ChannelUse, Colour, ExposureSettings, Frame, Illumination, Reconstruction, WhiteReference
 from services.instrument.capture import ExposedCapture, Press, split_notes
-from services.instrument.capture_pipeline import CapturePipeline, expose
+from services.instrument.capture_pipeline import CapturePipeline
+from services.instrument.press_exposure import expose_live, expose_press
 from services.records.capture_target import CaptureTarget
 from tests.journey.conftest import SMALL_HEAD
 from tests.property.exam_sequences import ROUND_S, ROUNDS, TINY, Conditions, PlainFeedback, TinyReconstructor
@@ -50,9 +51,7 @@ class Bench:
             press,
             "20260101T000000-OD-000001",
             self.clock.wall(),
-            exposure.lit,
-            exposure.dark,
-            exposure.duration_s,
+            exposure,
             light=self.head.light.dose_report(),
             verdict=verdict,
         )
@@ -88,7 +87,7 @@ def test_a_failed_exposure_leaves_the_lamp_off(bench: Bench, fault: str, error: 
     with pytest.raises(error):
         bench.pipeline.expose("OD")
     with pytest.raises(error):
-        bench.pipeline.expose_live(("OD",))
+        expose_live(bench.head, ("OD",), bench.clock)
     assert bench.world.illumination is None
 
 
@@ -129,12 +128,12 @@ def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
     capture = record.capture
     assert (capture.id, capture.eye, capture.simulated) == (shot.id, "OD", True)
     assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
-    assert capture.report.reconstruction.seconds["expose"] == pytest.approx(shot.expose_s)
+    assert capture.report.reconstruction.seconds["expose"] == pytest.approx(shot.exposure.duration_s)
     assert set(record.files()) == {"raw.tiff", "dark.tiff", "picture.png", "green.jpg", "quick.jpg", "report.json"}
 
 
 def test_a_live_picture_is_exposed_in_the_aiming_colour(bench: Bench) -> None:
-    seen = bench.pipeline.expose_live(("OD",))
+    seen = expose_live(bench.head, ("OD",), bench.clock)
     jpeg, aim = bench.pipeline.live_picture(seen)
     assert seen.frame.illumination is not None
     assert seen.frame.illumination.colour == bench.head.spec.light.preview_colour
@@ -239,8 +238,8 @@ class FailsInRed:
 
 def test_other_colours_are_taken_after_the_dark_and_the_lit_frames_and_their_dose_counts(bench: Bench) -> None:
     head = bench.head
-    green = expose(head, ("OD",), bench.clock, count=2)
-    both = expose(head, ("OD",), bench.clock, count=2, colours=["red"])
+    green = expose_press(head, ("OD",), bench.clock, count=2)
+    both = expose_press(head, ("OD",), bench.clock, count=2, colours=["red"])
     assert [frame.illumination for frame in both.lit] == [Illumination("green")] * 2
     assert both.colours["red"].illumination == Illumination("red")
     assert both.dark.illumination is None
@@ -255,7 +254,9 @@ def test_other_colours_are_taken_after_the_dark_and_the_lit_frames_and_their_dos
 
 def test_a_colour_that_fails_leaves_the_lit_frames_and_its_reason(bench: Bench) -> None:
     before_j_per_cm2 = bench.head.light.ledger.spent_j_per_cm2("OD")
-    exposure = expose(replace(bench.head, camera=FailsInRed(bench)), ("OD",), bench.clock, count=3, colours=["red"])
+    exposure = expose_press(
+        replace(bench.head, camera=FailsInRed(bench)), ("OD",), bench.clock, count=3, colours=["red"]
+    )
     assert (len(exposure.lit), dict(exposure.colours)) == (3, {})
     spent_j_per_cm2 = bench.head.light.ledger.spent_j_per_cm2("OD") - before_j_per_cm2
     assert exposure.dose_j_per_cm2 == pytest.approx(spent_j_per_cm2), "the red light was given, too"
@@ -307,11 +308,12 @@ def seen_lights(bench: Bench, *, white: bool, spoil: bool = False) -> Mapping[Co
     head = replace(bench.head, calibration=replace(bench.head.calibration, white=reference, bad=bad))
     reconstructor, colours = bench.pipeline.reconstructor, SeesLights()
     pipeline = CapturePipeline(head, bench.clock, reconstructor, reconstructor, PlainFeedback(), colours=colours)
-    taken = expose(head, ("OD",), bench.clock, colours=["red"])
-    shot = replace(bench.exposed(), frames=taken.lit, dark=taken.dark, colours=taken.colours)
+    taken = expose_press(head, ("OD",), bench.clock, colours=["red"])
+    shot = replace(bench.exposed(), exposure=taken)
     if spoil:
         cut = {colour: replace(one, counts=one.counts[::2]) for colour, one in taken.colours.items()}
-        shot = replace(shot, frames=tuple(replace(one, counts=one.counts[::2]) for one in taken.lit), colours=cut)
+        lit = tuple(replace(one, counts=one.counts[::2]) for one in taken.lit)
+        shot = replace(shot, exposure=replace(taken, lit=lit, colours=cut))
     assert isinstance(list(pipeline.reconstruct(shot, budget_s=5.0))[-1], Reconstruction)
     frames = {"green": taken.lit[0], "red": taken.colours["red"]}
     assert taken.dark is not None

@@ -10,8 +10,9 @@ from device.config.radiometry import BeamSpec, RadiometrySpec
 from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.recon.colour_reconstructor import ColourReconstruction
-from services.instrument.capture_pipeline import expose, plan_pipeline
+from services.instrument.capture_pipeline import plan_pipeline
 from services.instrument.press_colours import colours_of_lamp
+from services.instrument.press_exposure import expose_press
 from services.records.capture import OtherColour
 from tests.simulated import coarse
 
@@ -49,7 +50,7 @@ def test_a_press_of_a_ring_with_amber_gives_a_picture_in_colour(tmp_path: Path) 
     clock = VirtualClock()
     head = open_head(spec, clock, MemoryLedger(clock))
     try:
-        press = expose(head, ("OD",), clock, colours=colours_of_lamp(spec, ("red",)))
+        press = expose_press(head, ("OD",), clock, colours=colours_of_lamp(spec, ("red",)))
         pipeline = plan_pipeline(head, clock, tmp_path)
         assert pipeline.colours is not None
         green_steps = pipeline.reconstructor.steps(press.lit[0].counts, simulated=True)

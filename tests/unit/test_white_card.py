@@ -21,7 +21,8 @@ from device.recon.colour_reconstructor import ColourReconstruction
 from device.recon.white_balance import OVER_GREEN, RGB, balanced, light_dn_per_s, white_ratios
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Colour, Frame, Illumination, Psf, Sensor, WhiteReference
-from services.instrument.capture_pipeline import expose, plan_pipeline
+from services.instrument.capture_pipeline import plan_pipeline
+from services.instrument.press_exposure import expose_press
 from services.workshop.calibration_words import details
 from services.workshop.check_head import with_archive
 from services.workshop.white_card_check import measure_white_card
@@ -72,7 +73,7 @@ def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tm
     head = open_head(measured.spec, clock, MemoryLedger(clock))
     try:
         pipeline = plan_pipeline(head, clock, tmp_path)
-        press = expose(head, ("OD",), clock, colours=("red",))
+        press = expose_press(head, ("OD",), clock, colours=("red",))
         retina = world(measured.spec).retina
         assert press.dark is not None
         lights = {
