@@ -95,21 +95,27 @@ JOURNEYS := tests/browser/test_page.py
 # What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below nine minutes.
 FAULTS := tests/hard tests/physics tests/property
 NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
+# Workers take file after file in the order given: what takes long comes first, so that no worker begins it when the
+# others end. pytest drops a file that is named beside its folder, so that each is named once.
+IN_ORDER := --dist loadfile --no-loadscope-reorder
 # Many tests wait for a clock, a process or a browser: three workers keep two cores busy.
-WORKERS := -n 3 --dist loadfile
+WORKERS := -n 3 $(IN_ORDER)
 # A test of the page waits for the page's debounce, for fades and for the browser's start.
-PAGE_WORKERS := -n 4 --dist loadfile
+PAGE_WORKERS := -n 4 $(IN_ORDER)
+LONG_FAULTS := $(addprefix tests/,hard/test_press_and_command.py property/test_simulated_mark.py)
+LONG_PAGES := $(addprefix tests/browser/,test_calibration_wizard.py test_software_update.py test_visit.py test_viewer.py test_page_states.py)
+LONG_GOLDEN := $(addprefix tests/golden/,test_golden_http.py test_golden_files.py test_golden_cli.py test_golden_exam.py)
+tests_of = $(wildcard $(addsuffix /test_*.py,$(1)))
 
-# The page's tests come first: they take longest of all files, and wait while the others compute.
 test: .venv/kernels browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
-	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
+	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests/journey $(call tests_of,tests) tests/unit
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
 test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
-	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(FAULTS)
+	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(LONG_FAULTS) $(filter-out $(LONG_FAULTS),$(call tests_of,$(FAULTS)))
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
-	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR tests/browser $(addprefix --ignore=,$(JOURNEYS))
+	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR $(LONG_PAGES) $(filter-out $(LONG_PAGES) $(JOURNEYS),$(call tests_of,tests/browser))
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper --timeout 900 tests/physics
@@ -127,7 +133,7 @@ FORMAT ?= verity
 KEYS ?= out/keys
 
 test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files and scenes with their golden records.
-	@umockdev-wrapper $(BIN)/python -m pytest -n auto --dist loadfile tests/golden
+	@umockdev-wrapper $(BIN)/python -m pytest -n auto $(IN_ORDER) $(LONG_GOLDEN) $(filter-out $(LONG_GOLDEN),$(call tests_of,tests/golden))
 
 test-exam: .venv/ready ## Run ten thousand random sequences of presses, faults and signals on the exam; N=count.
 	@$(BIN)/python -m tests.property.exam_sequences $(N)

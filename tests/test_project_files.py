@@ -109,6 +109,25 @@ def test_every_make_target_has_an_explanation() -> None:
     assert set(phony[1].split()) == set(targets)
 
 
+def pytest_arguments(target: str) -> list[str]:
+    """Return the files and folders of a make target for pytest; `make -n` prints the commands without running them."""
+    printed = subprocess.run(["make", "-n", target], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    commands = [shlex.split(line) for line in printed.splitlines() if "-m pytest" in line]
+    return [word for words in commands for word in words if re.match(r"tests(/|$)", word)]
+
+
+def test_every_test_file_is_run_by_a_make_target_that_names_it_once() -> None:
+    """pytest drops a file that is named beside a folder that holds it, and then leaves out what that folder ignores."""
+    named = {target: pytest_arguments(target) for target in make_targets() if target.startswith("test")}
+    twice = [
+        (target, one, other) for target, all in named.items() for one in all for other in all if f"{one}/" in other
+    ]
+    assert not twice
+    run = [one for all in named.values() for one in all]
+    tests = [name for name in files() if re.fullmatch(r"tests/(.+/)?test_\w+\.py", name)]
+    assert not [name for name in tests if not any(name == one or name.startswith(f"{one}/") for one in run)]
+
+
 def test_make_clean_removes_all_that_git_ignores() -> None:
     """Everything in .gitignore is generated and can be generated again."""
     recipe = text("Makefile").split("\nclean:")[1].split("\n\n")[0]
