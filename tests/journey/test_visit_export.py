@@ -92,16 +92,15 @@ def test_a_copy_on_a_usb_drive_is_complete_and_an_earlier_one_stays(rig: Any, vi
     assert len(list(stick.iterdir())) == 2
 
 
-@pytest.mark.parametrize(
-    "folder", ["/", "/etc", "{stick}/..", "{stick}/", "{stick}/../USB STICK", "..", "\x00", "{other}"]
-)
-def test_only_a_mounted_usb_drive_is_written(rig: Any, visit: Any, stick: Path, folder: str) -> None:
+def test_only_a_mounted_usb_drive_is_written(rig: Any, visit: Any, stick: Path) -> None:
     other = stick.parent / "not mounted"
     other.mkdir()
-    order = {"key": next(keys), "folder": folder.format(stick=stick, other=other)}
-    answer: httpx.Response = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order)
-    assert (answer.status_code, answer.json()["code"]) == (503, "stick.gone")
-    assert list(stick.iterdir()) == list(other.iterdir()) == []
+    folders = ("/", "/etc", f"{stick}/..", f"{stick}/", f"{stick}/../USB STICK", "..", "\x00", f"{other}")
+    for folder in folders:
+        order = {"key": next(keys), "folder": folder}
+        answer: httpx.Response = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order)
+        assert (folder, answer.status_code, answer.json()["code"]) == (folder, 503, "stick.gone")
+        assert list(stick.iterdir()) == list(other.iterdir()) == []
 
 
 def test_a_removed_usb_drive_is_an_error_and_the_same_request_succeeds_later(
