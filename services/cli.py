@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 from typer.core import TyperGroup
 
+# Before numpy is imported: matrices are small here, and idle threads of BLAS would take a processor from the solvers.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import DiffuscopeError, SettingError

@@ -7,7 +7,7 @@ only if its measured cost fits into the time that is left.
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from math import isfinite, isinf
 from threading import Lock
@@ -51,6 +51,7 @@ from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, w
 from device.recon.solvers.solver import Diagnostics, Solver
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
+Check = Future[Consistency | None]
 CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
 
 
@@ -291,14 +292,18 @@ class Reconstructor:
         """
         self._refuse_other_shapes(counts)
         run, task = _Run(self, counts, dark, deadline, rounds), refraction
+        check: Check | None = None
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick and refract:
                 task = self._estimate_refraction(run, task, others)
             if not run.has_time_for(stage):
                 break
+            check = self._begin_check(run, stage)
             pauses = stage is self.stages[-1] and len(self.stages) > 1
             yield from run.solve(stage, pauses, None if stage is self.stages[0] else joined)
+            if check is not None:
+                wait([check])
             yield StageResult(stage.recipe, stage.shown, last=stage is self.stages[-1])
         solved_s = self.clock.now_s()
         picture = to_sensor(run.done.picture, run.done.grid)
@@ -310,7 +315,25 @@ class Reconstructor:
             self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
         if isinstance(run.refraction, Refraction) or run.cylinder_s > 0:
             seconds["cylinder"] = run.cylinder_s
-        yield Reconstruction(picture, self._report(run, seconds), simulated)
+        yield Reconstruction(picture, self._report(run, seconds, check), simulated)
+
+    def _begin_check(self, run: "_Run", stage: _Stage) -> Check | None:
+        """Begin the PSF consistency check of a frame of one stage in a thread, beside its solver; not with a deadline.
+
+        Several stages pause between rounds, where a call for another frame may use the check.
+        """
+        if self._consistency is None or run.deadline is not None or len(self.stages) > 1:
+            return None
+        for c in range(run.channels):
+            run.channel(c)  # finds the defects
+        aside = ThreadPoolExecutor(1, "psf-consistency")
+        check = aside.submit(self._consistency, run.counts, self._psf_scale(stage.eye), run.known_defects)
+        aside.shutdown(wait=False)
+        return check
+
+    def _psf_scale(self, eye: Wavefront | None) -> float:
+        """Return the scale of the stored PSF for an eye: 1 for none."""
+        return 1.0 if self.refractor is None or eye is None else self.refractor.scale(eye.m_dpt)
 
     def begin_refraction(
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None, *, with_cylinder: bool = True
@@ -385,7 +408,7 @@ class Reconstructor:
                 f"the frame has {counts.shape[:2]} pixels, the calibration {self.shape}", "Use the head's own PSF."
             )
 
-    def _report(self, run: "_Run", seconds: dict[str, float]) -> Report:
+    def _report(self, run: "_Run", seconds: dict[str, float], check: Check | None) -> Report:
         assert run.solved is not None
         recipe, diagnostics, frame = run.done.recipe, run.solved.diagnostics, run.solved.frame
         dark = not frame.mean_dn > 0 or diagnostics.noise_dn == 0
@@ -396,10 +419,11 @@ class Reconstructor:
             **diagnostics.quality,
         }
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
-        psf_scale = 1.0 if self.refractor is None or run.eye is None else self.refractor.scale(run.eye.m_dpt)
+        psf_scale = self._psf_scale(run.eye)
         match = psf_match(quality)
         if self._consistency is not None and not dark:
-            match = self._checked_match(self._consistency(run.counts, psf_scale, run.known_defects), quality)
+            figures = check.result() if check else self._consistency(run.counts, psf_scale, run.known_defects)
+            match = _checked_match(figures, quality)
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience)
         explained = not dark and is_explained(quality, match, misfit)
         eye = self._reported_refraction(run.refraction, explained and is_lit(quality))
@@ -426,14 +450,6 @@ class Reconstructor:
             warnings=warnings,
         )
 
-    @staticmethod
-    def _checked_match(figures: Consistency | None, quality: dict[str, float | None]) -> Match:
-        """Return whether frame and PSF match, and add the figures of the consistency check to `quality`."""
-        if figures is None:
-            return Match.UNKNOWN
-        quality |= figures.report_figures
-        return figures.match
-
     def _reported_refraction(
         self, eye: Refraction | NoRefraction | None, explained: bool
     ) -> Refraction | NoRefraction | None:
@@ -454,6 +470,14 @@ class Reconstructor:
             other = self.refractor.otf(stage.model, Wavefront(eye.m_dpt))
             gain_db = self._gain(stage.model.otf, other, PowerLaw(log_power, slope), noise_dn)
         return {"j0_dpt": -eye.j0_dpt, "j45_dpt": eye.j45_dpt, "gain_db": gain_db}
+
+
+def _checked_match(figures: Consistency | None, quality: dict[str, float | None]) -> Match:
+    """Return whether frame and PSF match, and add the figures of the consistency check to `quality`."""
+    if figures is None:
+        return Match.UNKNOWN
+    quality |= figures.report_figures
+    return figures.match
 
 
 @dataclass(frozen=True)
