@@ -42,10 +42,18 @@ from typing import ClassVar
 
 
 class DiffuscopeError(Exception):
-    """Base class of all errors: `code` identifies the error in the log, `remedy` is an instruction for the operator.
+    """Base class of all errors: `code` identifies the error in the log.
 
-    `message` describes the cause. `n` (a number of minutes or patients) and `wait_s` (seconds until a retry) are
-    parameters of the page's messages, None where the message has none.
+    Parameters
+    ----------
+    message
+        Sentence that describes the cause.
+    remedy
+        Instruction for the operator; by default `default_remedy` of the class.
+    n
+        Number of minutes or patients in the page's message; None: the message has none.
+    wait_s
+        Seconds until a retry in the page's message; None: the message has none.
     """
 
     code: ClassVar[str] = "fault"

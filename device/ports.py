@@ -26,16 +26,39 @@ class Camera(Protocol):
         """Properties of the opened sensor for a technician, such as `sensor` and `format`; empty if none are known."""
 
     def expose(self, shot: ExposureSettings, into: NDArray[np.uint16] | None = None) -> Frame:
-        """Return one frame whose exposure began after this call; `into` (rows, cols) is filled if given.
+        """Return one frame whose exposure began after this call, never an old one.
 
-        Raises CameraMissing or CameraStalled; never returns an old frame.
+        Parameters
+        ----------
+        shot
+            Exposure time, above 0 and up to 10 s.
+        into
+            Buffer (rows, cols) that becomes the counts of the frame.
+
+        Returns
+        -------
+        Frame
+            Raw counts, uint16 (rows, cols).
+
+        Raises
+        ------
+        CameraMissing
+            The camera does not answer.
+        CameraStalled
+            It answers, and no frame arrives.
         """
 
     def prepare(self, shot: ExposureSettings) -> None:
-        """Set the exposure time of the next frame on the sensor ahead of time, in the dark."""
+        """Set the exposure time of the next frame on the sensor ahead of time, in the dark.
+
+        Parameters
+        ----------
+        shot
+            Exposure time, above 0 and up to 10 s.
+        """
 
     def close(self) -> None:
-        """Release the sensor; idempotent."""
+        """Release the sensor. A second call does nothing."""
 
 
 class LightContext(Protocol):
@@ -51,52 +74,122 @@ class LightContext(Protocol):
 
 
 class Light(Protocol):
-    """Ring of LEDs around the light path; dark outside a context of `on`."""
+    """Ring of LEDs around the light path, which is dark outside of a context of `on`."""
 
     @property
     def illumination(self) -> Illumination | None:
         """Present illumination; None when dark."""
 
     def on(self, illumination: Illumination) -> LightContext:
-        """Return a context during which the lamp is on; a context that is never entered stays dark.
+        """Return a context during which the lamp is on.
 
-        Raises LightFault or LightLimit, here or on entry, and is then dark.
+        A context that is never entered stays dark. After an error, here or on entry, the lamp is dark.
+
+        Parameters
+        ----------
+        illumination
+            Colour, and level above 0 and up to 1 (full drive).
+
+        Returns
+        -------
+        LightContext
+            Context that turns the lamp on and off.
+
+        Raises
+        ------
+        LightFault
+            The lamp cannot be driven.
+        LightLimit
+            The light would exceed a limit of the eye.
         """
 
     def off(self) -> None:
-        """Turn the lamp off; always allowed, idempotent."""
+        """Turn the lamp off. It is always allowed, and a second call does nothing."""
 
 
 class Thermometer(Protocol):
     """Temperature sensor inside the head."""
 
     def read_c(self) -> float:
-        """Return the temperature, degrees Celsius; BusFault without an answer or with an implausible one."""
+        """Return the temperature of the head.
+
+        Returns
+        -------
+        float
+            Temperature in degrees Celsius.
+
+        Raises
+        ------
+        BusFault
+            No answer, or an implausible one.
+        """
 
 
 class Battery(Protocol):
     """Battery gauge of the device."""
 
     def read(self) -> BatteryState:
-        """Return the battery's state; BusFault without an answer or with an implausible one."""
+        """Return the battery's state.
+
+        Returns
+        -------
+        BatteryState
+            Charge as a fraction, 0 to 1, and voltage in V.
+
+        Raises
+        ------
+        BusFault
+            No answer, or an implausible one.
+        """
 
 
 class HeadMemory(Protocol):
     """Non-volatile memory in the optical head: serial number and id of its calibration."""
 
     def read(self) -> HeadIdentity | None:
-        """Return the stored identity, None if never written.
+        """Return the stored identity of the head.
 
-        BusFault without an answer, MemoryDamaged if the content is incomplete.
+        Returns
+        -------
+        HeadIdentity or None
+            Serial number and id of the calibration; None if nothing was written yet.
+
+        Raises
+        ------
+        BusFault
+            No answer.
+        MemoryDamaged
+            The content is incomplete.
         """
 
     def write(self, identity: HeadIdentity) -> None:
-        """Store the identity in non-volatile memory and verify it by reading back; BusFault on failure."""
+        """Store the identity of the head in non-volatile memory, and verify it by reading it back.
+
+        Parameters
+        ----------
+        identity
+            Serial number and id of the calibration.
+
+        Raises
+        ------
+        BusFault
+            No answer, or other content than was written.
+        """
 
 
 @dataclass(frozen=True)
 class Chips:
-    """Chips of a head; None for each that the head does not have."""
+    """Chips of a head, None for each that it does not have.
+
+    Attributes
+    ----------
+    thermometer
+        Temperature sensor inside the head.
+    battery
+        Battery gauge.
+    memory
+        Memory with the head's identity.
+    """
 
     thermometer: Thermometer | None = None
     battery: Battery | None = None
@@ -110,4 +203,15 @@ class Button(Protocol):
     """Shutter button on the handle."""
 
     def pressed_since_s(self) -> float | None:
-        """Return the clock time since which the button is pressed, None while released; BusFault if unreadable."""
+        """Return since when the button is pressed.
+
+        Returns
+        -------
+        float or None
+            Time of the clock in s; None while the button is released.
+
+        Raises
+        ------
+        BusFault
+            The button cannot be read.
+        """

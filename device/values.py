@@ -294,10 +294,11 @@ class ChannelUse:
 
 @dataclass(frozen=True)
 class Report:
-    """Report of a reconstruction; its fields are the keys of `report.json`.
+    """Report of a reconstruction, whose fields are the keys of `report.json`.
 
-    Units are in the names; a name without a unit is a ratio. The keys inside of the mappings, and the JSON schema, are
-    in `services/research/report_schema.py`, which takes the descriptions of the fields from here.
+    Units are in the names; a name without a unit is a ratio. The keys inside of the mappings, and the JSON
+    schema, are in `services/research/report_schema.py`, which takes the descriptions of the fields from
+    here.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, bool]] = {"use_attribute_docstrings": True}
@@ -358,9 +359,17 @@ class Report:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Reconstructed picture of the retina: linear float32, rows x cols (x 3) of the sensor, with its report.
+    """Reconstructed picture of the retina, with its report.
 
-    It is in DN of one exposure; of a burst, in DN of its first used frame.
+    Attributes
+    ----------
+    picture
+        Linear float32, (rows, cols) or (rows, cols, 3) of the sensor, in DN of one exposure; of a burst, in
+        DN of its first used frame.
+    report
+        Figures of the reconstruction.
+    simulated
+        True for a picture that shows no real eye.
     """
 
     picture: Image

@@ -24,9 +24,16 @@ NO_TIME = "the time budget left no time to join the burst"
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame of a burst before the other ones are known: its quick look, and what is needed to join it.
+    """A frame of a burst before the other ones are known.
 
-    `refraction`: the task that estimates its refraction, if it has begun.
+    Attributes
+    ----------
+    look
+        Quick look of the frame.
+    seen
+        What is needed to join it.
+    refraction
+        Task that estimates its refraction, if it has begun.
     """
 
     look: StageResult
@@ -35,10 +42,19 @@ class PreparedFrame:
 
 
 class BurstReconstructor:
-    """Reconstruction of bursts by `single`, which also makes quick looks and pictures of one frame.
+    """Reconstruction of bursts: their frames are registered, joined and solved as one.
 
-    `timed`: the costs of the steps are measured on noise, for deadlines. One burst at a time; between two of its steps
-    `single` may make quick looks of other frames. Not thread-safe.
+    One burst at a time. Between two of its steps `single` may make quick looks of other frames. Not
+    thread-safe.
+
+    Parameters
+    ----------
+    single
+        Reconstructor of the joined frame, of quick looks and of pictures of one frame.
+    planner
+        Planner of the FFTs.
+    timed
+        True: measure the costs of the steps on noise, for deadlines.
     """
 
     def __init__(self, single: Reconstructor, planner: Planner, *, timed: bool = True) -> None:
@@ -64,10 +80,26 @@ class BurstReconstructor:
                 assert isinstance(step, RoundDone)
 
     def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
-        """Return a frame (rows, cols) with its quick look, ready for `steps`, while the next frames are exposed.
+        """Return a frame with its quick look, ready for `steps`, while the next frames are exposed.
 
-        With `refract` a thread begins to estimate its refraction; a burst needs it of its first used frame only.
-        FrameError for a frame without light, or with too many missing pixels.
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        refract
+            True: a thread begins to estimate its refraction. A burst needs it of its first used frame only.
+
+        Returns
+        -------
+        PreparedFrame
+            Quick look, and what is needed to join the frame.
+
+        Raises
+        ------
+        FrameError
+            The frame has no light, or too many missing pixels.
         """
         seen = self.joiner.see(counts, dark)
         stage = self.single.stages[0]
@@ -91,12 +123,36 @@ class BurstReconstructor:
     ) -> Iterator[Step]:
         """Yield the quick look of the first frame, RoundDone after each frame and round, and the picture of the burst.
 
-        `frames` are uint16 or float32 (rows, cols), all with the dark frame `dark`; `unusable` holds the reason of each
-        frame that must not enter the picture, by its index, never the first; `prepared` the frames that are prepared
-        with this dark frame, by index. The deadline moves by the time until the consumer continues after RoundDone. A
-        burst of one usable frame gives the picture of that frame; a deadline that leaves no time to join them gives
-        that of the first. Without `refract` the PSF is that of the picture before. FrameError for another shape, for a
-        first frame with too many missing pixels for a quick look, or if no frame can be used.
+        The deadline moves by the time until the consumer continues after RoundDone. A burst of one usable frame
+        gives the picture of that frame; a deadline that leaves no time to join them gives that of the first.
+
+        Parameters
+        ----------
+        frames
+            Counts of each frame, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of all of them; None: that of the calibration.
+        simulated
+            Mark that is copied to the result.
+        deadline
+            Time by which the picture is needed; None: all rounds.
+        unusable
+            Reason of each frame that must not enter the picture, by its index, never the first.
+        prepared
+            Frames that are prepared with this dark frame, by index.
+        refract
+            False: the PSF is that of the picture before.
+
+        Yields
+        ------
+        StageResult, RoundDone or Reconstruction
+            The last one is the picture, linear float32 (rows, cols) of the sensor.
+
+        Raises
+        ------
+        FrameError
+            A frame has another shape, the first one has too many missing pixels for a quick look, or no frame
+            can be used.
         """
         run = _Run(self, deadline, refract)
         ready = dict(prepared or {})

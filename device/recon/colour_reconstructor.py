@@ -38,8 +38,12 @@ def without_psf(colour: Colour) -> ChannelUse:
 class ColourReconstruction(Reconstruction):
     """Reconstruction in green with a picture in colour.
 
-    `colour`: linear float32 (rows, cols, 3), red, green and blue, cropped to the illuminated field. `others`: report of
-    each other colour.
+    Attributes
+    ----------
+    colour
+        Linear float32 (rows, cols, 3), red, green and blue, cropped to the illuminated field.
+    others
+        Report of each other colour.
     """
 
     colour: Image
@@ -49,10 +53,19 @@ class ColourReconstruction(Reconstruction):
 class ColourReconstructor:
     """Solution of the frames in the other colours of light, and their joining to the picture in green.
 
-    `green` is the reconstructor of the pictures in green, or in the light `reference`; `others` that of each other
-    colour: with the PSF of that colour, or `green` itself where one PSF holds for any colour; one of bursts where there
-    are several frames. Between two steps they may make quick looks of other frames. `timed`: the cost of joining is
-    measured on noise, for deadlines. Not thread-safe.
+    Between two steps the reconstructors may make quick looks of other frames. Not thread-safe.
+
+    Parameters
+    ----------
+    green
+        Reconstructor of the pictures in green, or in the light `reference`.
+    others
+        Reconstructor of each other colour: with the PSF of that colour, or `green` itself where one PSF
+        holds for any colour; one of bursts where there are several frames.
+    reference
+        Colour of the pictures of `green`.
+    timed
+        True: measure the cost of joining on noise, for deadlines.
     """
 
     def __init__(
@@ -98,11 +111,31 @@ class ColourReconstructor:
     ) -> Iterator[Step]:
         """Yield the steps of `green`, RoundDone after each round of the other colours, and the picture in colour.
 
-        `frames`: those of each other colour, (rows, cols), with the dark frame `dark`; `missing` are the
-        colours without a frame, with their reasons; `lights_dn_per_s` the light of each colour at full drive
-        (`white_balance`), None if it is not known: the hue is then neutral. `deadline` moves by the time until the
-        consumer continues after RoundDone; the first stage of each colour runs also after it (`deadline_of_green`). The
-        picture is a ColourReconstruction if another colour was solved; its report lists every colour.
+        The deadline moves by the time until the consumer continues after RoundDone. The first stage of each
+        colour runs also after it (`deadline_of_green`).
+
+        Parameters
+        ----------
+        green
+            Steps of the picture in green.
+        frames
+            Frames of each other colour, (rows, cols).
+        dark
+            Dark frame of all of them; None: that of the calibration.
+        simulated
+            Mark that is copied to the result.
+        deadline
+            Time by which the picture is needed; None: all rounds.
+        missing
+            Colours without a frame, with their reasons.
+        lights_dn_per_s
+            Light of each colour at full drive in DN/s (`white_balance`); None if it is not known: the hue is
+            then neutral.
+
+        Yields
+        ------
+        StageResult, RoundDone or Reconstruction
+            The last one is a ColourReconstruction if another colour was solved; its report lists every colour.
         """
         run = _Run(self, deadline)
         made = yield from run.green(green)
@@ -130,7 +163,20 @@ class ColourReconstructor:
         yield ColourReconstruction(made.picture, report, made.simulated or simulated, joined.picture, others)
 
     def deadline_of_green(self, deadline: Deadline, colours: Collection[Colour]) -> Deadline:
-        """Return the deadline of the picture in green, earlier by what `colours` take at least, at most by half."""
+        """Return the deadline of the picture in green.
+
+        Parameters
+        ----------
+        deadline
+            Deadline of the picture in colour.
+        colours
+            Other colours.
+
+        Returns
+        -------
+        Deadline
+            Earlier by what `colours` take at least, at most by half.
+        """
         firsts = [self.singles[colour].stages[0] for colour in colours]
         least_s = sum(first.start_cost.seconds + first.finish_cost.seconds for first in firsts)
         return deadline.later(-min(least_s + (self.join_cost.seconds if firsts else 0.0), deadline.left_s() / 2))
@@ -156,9 +202,16 @@ class ColourReconstructor:
         return replace(joined, picture=picture, channels=channels)
 
     def refocus(self, colour: Colour, eye: Wavefront | None) -> None:
-        """Use the PSF of a colour for `eye` in its last stage; None selects the stored PSF.
+        """Use the PSF of a colour for an eye in its last stage.
 
         A colour that shares green's reconstructor keeps the PSF of the last green picture.
+
+        Parameters
+        ----------
+        colour
+            Colour of light.
+        eye
+            Wavefront of the eye; None selects the stored PSF.
         """
         if colour not in self._otfs:
             return

@@ -31,11 +31,29 @@ from device.values import Calibration
 class Method:
     """Description of one method: name, one sentence, cost in real FFT pairs, and the constructor of its solver.
 
-    An FFT pair is one forward and one inverse FFT. `start_pairs` are the pairs of `Solver.start`, `round_pairs` those
-    of each round, `rounds` the default number of rounds; both are 0 for a closed form. `images`: number of float32
-    arrays of the grid's shape that the solver holds. `periodic`: the grid has the size of the sensor
-    (`periodic_model`), else a margin (`tight_model`). `build` is called once per stage, before the first frame.
-    `settings`: the parameters that a user may set; the solver of a method with settings has `configure`.
+    An FFT pair is one forward and one inverse FFT.
+
+    Attributes
+    ----------
+    name
+        Name of the method.
+    sentence
+        What it does, in one sentence.
+    build
+        Constructor of the solver, called once per stage, before the first frame.
+    start_pairs
+        FFT pairs of `Solver.start`.
+    round_pairs
+        FFT pairs of each round; 0 for a closed form.
+    rounds
+        Default number of rounds; 0 for a closed form.
+    images
+        Number of float32 arrays of the grid's shape that the solver holds.
+    periodic
+        True: the grid has the size of the sensor (`periodic_model`). False: it has a margin
+        (`tight_model`).
+    settings
+        Parameters that a user may set; the solver of a method with settings has `configure`.
     """
 
     name: str
@@ -49,7 +67,29 @@ class Method:
     settings: tuple[Setting, ...] = ()
 
     def solver(self, model: Model, calibration: Calibration, planner: Planner, settings: Settings) -> Solver:
-        """Return the planned solver with these settings; SettingError for an unknown name or a value out of range."""
+        """Return the planned solver with these settings.
+
+        Parameters
+        ----------
+        model
+            Forward model of the stage.
+        calibration
+            Calibration of the model.
+        planner
+            Planner of the FFTs.
+        settings
+            Values by name.
+
+        Returns
+        -------
+        Solver
+            Solver, planned for the grid of `model`.
+
+        Raises
+        ------
+        SettingError
+            A name is unknown, or a value out of range.
+        """
         check_settings(self.name, self.settings, settings)
         solver = self.build(model, calibration, planner)
         if settings:
@@ -59,7 +99,26 @@ class Method:
         return solver
 
     def model(self, calibration: Calibration, shape: Pair, n: int, planner: Planner, index: int) -> Model:
-        """Return the forward model for a sensor of `shape` (rows, cols), n x n pixels per sample and PSF `index`."""
+        """Return the forward model of the method for a sensor.
+
+        Parameters
+        ----------
+        calibration
+            Calibration with the PSF and the lit field.
+        shape
+            (rows, cols) of the sensor in pixels.
+        n
+            n x n pixels become one sample.
+        planner
+            Planner of the FFTs.
+        index
+            Index of the PSF in the calibration.
+
+        Returns
+        -------
+        Model
+            Forward model on the grid of the method.
+        """
         return (periodic_model if self.periodic else tight_model)(calibration, shape, n, planner, index)
 
     @property
@@ -68,7 +127,18 @@ class Method:
         return self.start_pairs + self.rounds * self.round_pairs
 
     def memory_bytes(self, grid: Grid) -> int:
-        """Return the bytes of all arrays on a grid: dark, gain and picture of the sensor, the FFT plans, the images."""
+        """Return the bytes of all arrays on a grid.
+
+        Parameters
+        ----------
+        grid
+            Grid of the stage.
+
+        Returns
+        -------
+        int
+            Bytes of dark, gain and picture of the sensor, the FFT plans and the images of the solver.
+        """
         sensor = 4 * grid.sensor[0] * grid.sensor[1]
         plans = (1 + (self.round_pairs > 0)) * RealFft.memory_bytes(grid.shape)
         return 3 * sensor + plans + 4 * self.images * grid.size

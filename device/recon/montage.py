@@ -45,10 +45,25 @@ Floats = NDArray[np.float64]
 class Placement:
     """Place of one picture in a montage, relative to the first picture.
 
-    What is at (r, c) of the first picture stands in this one at (r, c) + `shift_px`, turned about the picture's centre
-    by `rotation_deg`, counter-clockwise as displayed; on the sphere exactly so at the centre only. `peak` is the
-    normalised correlation with the picture to which it was registered, `overlap` their common part as a share of the
-    smaller field; both None for the first. `reason` says why a picture is not used.
+    What is at (r, c) of the first picture stands in this one at (r, c) + `shift_px`, turned about the
+    picture's centre by `rotation_deg`. On the sphere this is exact at the centre only.
+
+    Attributes
+    ----------
+    index
+        Index of the picture.
+    used
+        True: it is part of the montage.
+    shift_px
+        Shift in pixels (rows, cols).
+    rotation_deg
+        Rotation, counter-clockwise as displayed.
+    peak
+        Normalised correlation with the picture to which it was registered; None for the first.
+    overlap
+        Their common part as a share of the smaller field; None for the first.
+    reason
+        Why it is not used; None if it is.
     """
 
     index: int
@@ -69,10 +84,18 @@ class Placement:
 
 @dataclass(frozen=True)
 class Montage:
-    """Joined picture, linear (rows, cols) or (rows, cols, 3), and the place of each picture.
+    """Joined picture, and the place of each picture in it.
 
-    Pixel (0, 0) of the montage is at `origin_px` (rows, cols) of the first picture. `px_per_deg` is the scale with
-    which the pictures were placed on the sphere; None: on the plane.
+    Attributes
+    ----------
+    picture
+        Linear, (rows, cols) or (rows, cols, 3).
+    origin_px
+        (rows, cols) of pixel (0, 0) of the montage on the first picture.
+    placed
+        Place of each picture.
+    px_per_deg
+        Scale with which the pictures were placed on the sphere; None: on the plane.
     """
 
     picture: Image

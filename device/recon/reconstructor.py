@@ -57,10 +57,18 @@ CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings of one stage: method, binning (`bin` x `bin` sensor pixels per sample) and the largest number of rounds.
+    """Settings of one stage.
 
-    `rounds` None means the default of the method. `settings` are names and values of the method's `settings`; what is
-    not set is chosen from the frame.
+    Attributes
+    ----------
+    method
+        Name of the method.
+    bin
+        bin x bin sensor pixels become one sample.
+    rounds
+        Largest number of rounds; None: the default of the method.
+    settings
+        Names and values of the method's settings; what is not set is chosen from the frame.
     """
 
     method: str = DEFAULT
@@ -71,7 +79,17 @@ class Recipe:
 
 @dataclass(frozen=True)
 class StageResult:
-    """Result of one stage: settings, shown part of its picture (linear, on its grid), and if it is the last stage."""
+    """Result of one stage.
+
+    Attributes
+    ----------
+    recipe
+        Settings of the stage.
+    picture
+        Shown part of its picture, linear, on its grid.
+    last
+        True for the last stage.
+    """
 
     recipe: Recipe
     picture: Image
@@ -176,18 +194,49 @@ class _Stage:
 
 
 class Reconstructor:
-    """Reconstruction of the frames of one calibration and one sensor shape; all planning is done at construction.
+    """Reconstruction of the frames of one calibration and one sensor shape.
 
-    `recipes` (empty: `default_schedule`) run in order; the last gives the final picture, the earlier ones quick looks.
-    Not thread-safe: one thread at a time. `timed` measures the cost of every step on noise, before the first deadline;
-    False saves this time where no deadline is used. `consistency` tests the PSF on each frame, outside the deadline
-    (for files). `audience`: the reader of the warnings. With `refract`, and with known geometry and field, the
-    refraction of the eye is estimated after the first stage (before a single one); the later stages use the PSF warped
-    accordingly, or the stored PSF if there is no reliable estimate; `field_fixed` takes the field of the calibration as
-    exact. It is estimated in a thread; its cylinder, if it fits into the deadline, while the picture is solved. The PSF
-    of the picture has the cylinder only if that is known before the solution begins: a deadline does not wait for it.
-    `methods`: the table in which the recipes' methods are looked up. SettingError if a bin is below 1, or for a method
-    that the table does not have.
+    All planning is done at construction. Not thread-safe: one thread at a time.
+
+    With `refract`, and with known geometry and field, the refraction of the eye is estimated after the
+    first stage (before a single one). The later stages use the PSF warped accordingly, or the stored PSF if
+    there is no reliable estimate. It is estimated in a thread, and its cylinder, if it fits into the
+    deadline, while the picture is solved. The PSF of the picture has the cylinder only if that is known
+    before the solution begins: a deadline does not wait for it.
+
+    Parameters
+    ----------
+    calibration
+        Calibration of the head.
+    shape
+        (rows, cols) of the sensor in pixels.
+    planner
+        Planner of the FFTs.
+    clock
+        Clock of the durations and deadlines.
+    recipes
+        Stages in their order; the last gives the final picture, the earlier ones quick looks. Empty:
+        `default_schedule`.
+    psf_index
+        Index of the PSF in the calibration.
+    refract
+        True: estimate the refraction of the eye.
+    consistency
+        Test of the PSF on each frame, outside the deadline (for files); None: no test.
+    timed
+        True: measure the cost of every step on noise, before the first deadline. False saves this time
+        where no deadline is used.
+    methods
+        Table in which the recipes' methods are looked up.
+    audience
+        Reader of the warnings.
+    field_fixed
+        True: the field of the calibration is exact.
+
+    Raises
+    ------
+    SettingError
+        A bin is below 1, or the table does not have a method.
     """
 
     def __init__(
@@ -258,7 +307,33 @@ class Reconstructor:
         rounds: int | None = None,
         quick: bool = False,
     ) -> Reconstruction:
-        """Return the best picture that fits into `deadline`, and its report: the last one of `steps`."""
+        """Return the best picture that fits into the deadline, and its report: the last one of `steps`.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32, (rows, cols) or (rows, cols, 3).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        simulated
+            Mark that is copied to the result.
+        deadline
+            Time by which the picture is needed; None: all rounds.
+        rounds
+            Largest number of rounds of every stage.
+        quick
+            True: only the first stage.
+
+        Returns
+        -------
+        Reconstruction
+            Linear float32, (rows, cols) or (rows, cols, 3) of the sensor, and its report.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape than the sensor, or too many pixels are missing.
+        """
         steps = self.steps(counts, dark, simulated=simulated, deadline=deadline, rounds=rounds, quick=quick)
         (picture,) = deque(steps, maxlen=1)
         assert isinstance(picture, Reconstruction)
@@ -278,17 +353,45 @@ class Reconstructor:
         refraction: RefractionTask | None = None,
         others: Sequence[Pixels] = (),
     ) -> Iterator[Step]:
-        """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
+        """Yield the result of each stage, then the best picture that fits into the deadline, with its report.
 
-        The picture is linear float32, (rows, cols) or (rows, cols, 3) of the sensor; `counts` and `dark` are uint16 or
-        float32 of that shape. `simulated` is copied to the result. The first stage always runs; with `quick` it is the
-        only one. `rounds` limits the rounds of every stage. With several stages a ROUND_DONE follows each round of the
-        last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
-        called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
-        sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
-        use the PSF of the picture before; `refraction` is the task of this frame, if it has begun, and `others` are the
-        other frames of its burst, which join the refraction without a `deadline`. FrameError for another shape than
-        that of the sensor, or if too many pixels are missing (`Preprocessor`).
+        The first stage always runs. With several stages a ROUND_DONE follows each round of the last one. The
+        deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be called
+        with `quick`.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32, (rows, cols) or (rows, cols, 3).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        simulated
+            Mark that is copied to the result.
+        deadline
+            Time by which the picture is needed; None: all rounds.
+        rounds
+            Largest number of rounds of every stage.
+        quick
+            True: only the first stage.
+        joined
+            Sum of a burst, which the later stages solve instead of `counts`: linear DN above dark with the gain
+            of the sensor, NaN for missing pixels.
+        refract
+            False: the later stages use the PSF of the picture before.
+        refraction
+            Task of this frame, if it has begun.
+        others
+            Other frames of its burst, which join the refraction without a `deadline`.
+
+        Yields
+        ------
+        StageResult, RoundDone or Reconstruction
+            The last one is the picture, linear float32, (rows, cols) or (rows, cols, 3) of the sensor.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape than the sensor, or too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
         run, task = _Run(self, counts, dark, deadline, rounds), refraction
@@ -338,9 +441,25 @@ class Reconstructor:
     def begin_refraction(
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None, *, with_cylinder: bool = True
     ) -> RefractionTask | None:
-        """Begin to estimate the refraction of a frame (rows, cols) in a thread; None if the calibration permits none.
+        """Begin to estimate the refraction of a frame in a thread.
 
         The task is for `steps` of this frame, with the same dark frame.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        defects
+            Flat indices of defective pixels, which are left out.
+        with_cylinder
+            True: estimate the cylinder, too.
+
+        Returns
+        -------
+        RefractionTask or None
+            None if the calibration permits no estimate.
         """
         if self.refractor is None:
             return None

@@ -102,9 +102,19 @@ class Entry:
 class Pair:
     """One recording as it is reconstructed: upright, channels red, green, blue.
 
-    `raw`: counts (rows, cols) or (rows, cols, 3). `psfs`: one PSF, or one per depth, of the same rows and columns.
-    `truth`: float32 (rows, cols) or (rows, cols, 3) in arbitrary linear units, NaN where nothing is known or compared;
-    None if there is no truth. `simulated` marks a frame of the simulator.
+    Attributes
+    ----------
+    name
+        Name of the recording.
+    raw
+        Counts, (rows, cols) or (rows, cols, 3).
+    psfs
+        One PSF, or one per depth, of the same rows and columns.
+    truth
+        Float32 (rows, cols) or (rows, cols, 3) in arbitrary linear units, NaN where nothing is known or
+        compared; None if there is no truth.
+    simulated
+        True for a frame of the simulator.
     """
 
     name: str
@@ -121,9 +131,20 @@ class Pair:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Pairs of one folder, in natural order of their names. Iteration reads one pair at a time.
+    """Pairs of one folder, in natural order of their names.
 
-    `notes` are sentences about files that are missing or left out.
+    Iteration reads one pair at a time.
+
+    Attributes
+    ----------
+    folder
+        Folder of the data set.
+    layout
+        How the files of such a data set are stored.
+    entries
+        Files of each pair.
+    notes
+        Sentences about files that are missing or left out.
     """
 
     folder: Path
@@ -141,7 +162,22 @@ class Dataset:
     def read(self, entry: Entry) -> Pair:
         """Return one pair with the facts of the layout applied.
 
-        FrameError or PsfError for a file that is missing or damaged, or whose size fits neither frame nor layout.
+        Parameters
+        ----------
+        entry
+            Files of the pair, one of `entries`.
+
+        Returns
+        -------
+        Pair
+            Frame, PSFs and truth, upright, (rows, cols) or (rows, cols, 3).
+
+        Raises
+        ------
+        FrameError
+            The frame or its truth is missing or damaged, or its size does not fit.
+        PsfError
+            A PSF is missing or damaged, or its size does not fit.
         """
         raw = as_raw(_upright(read_counts(entry.raw), self.layout.frames, self.layout.bgr))
         shape = (raw.pixels.shape[0], raw.pixels.shape[1])

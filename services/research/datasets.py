@@ -81,11 +81,27 @@ class Recogniser:
 
 
 def open_dataset(folder: Path | str, psf: Path | str | None = None, split: Split = "test") -> Dataset:
-    """Return the data set in a folder; its layout is recognised by its files.
+    """Return the data set in a folder, whose layout is recognised by its files.
 
-    `psf` replaces the PSF of the folder, for folders with none or with several. `split`: "test" leaves out pairs that
-    a list of test files (`dataset_test.csv`) does not name, "all" keeps them. SettingError for a folder of no known
-    layout, or without a PSF that fits.
+    Parameters
+    ----------
+    folder
+        Folder of the data set.
+    psf
+        File that replaces the PSF of the folder, for folders with none or with several.
+    split
+        "test" leaves out pairs that a list of test files (`dataset_test.csv`) does not name, "all" keeps
+        them.
+
+    Returns
+    -------
+    Dataset
+        Pairs in natural order of their names; no image is read yet.
+
+    Raises
+    ------
+    SettingError
+        The folder has no known layout or no PSF that fits, or the split is unknown.
     """
     folder = Path(folder)
     if split not in get_args(Split):

@@ -142,12 +142,42 @@ class Choice:
 
 @dataclass(frozen=True)
 class Frontier:
-    """Points of one scene on one machine, and the instrument's choice within `budget_s` seconds.
+    """Points of one scene on one machine, and the instrument's choice within a time budget.
 
-    `versions`: of the program and its libraries, by name. `timing` and `edge` describe times and Pareto front in words.
-    `best_mu` is empty for a colour frame. `dominated`: methods without a point on the Pareto front. `light`: bursts of
-    a scene, from one frame on; empty for a recorded frame. `left_out`: points without a result, with the reason.
-    `peers`: other people's solvers on the same frame.
+    Attributes
+    ----------
+    machine
+        Computer of the measurement.
+    versions
+        Versions of the program and its libraries, by name.
+    scene
+        Name of the scene or of the frame.
+    simulated
+        True for a frame of the simulator.
+    frame
+        Size of the frame in pixels.
+    region
+        Part of the picture that is scored.
+    timing
+        How times were measured, in words.
+    edge
+        What the Pareto front is, in words.
+    points
+        Each method, bin and number of rounds with time and scores.
+    best_mu
+        Best regularisation of each closed form; empty for a colour frame.
+    budget_s
+        Time budget of the choice in s.
+    choice
+        What the instrument chooses within the budget.
+    dominated
+        Methods without a point on the Pareto front.
+    light
+        Bursts of a scene, from one frame on; empty for a recorded frame.
+    left_out
+        Points without a result, with the reason.
+    peers
+        Other people's solvers on the same frame.
     """
 
     machine: Machine

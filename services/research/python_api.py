@@ -41,15 +41,36 @@ ImageSource = str | Path | NDArray[Any] | Raw | Psf
 
 
 class ReconstructionOptions(TypedDict, total=False):
-    """Keywords of `reconstruct` and `Reconstructor`; an option that is left out is chosen from PSF and frame.
+    """Keywords of `reconstruct` and `Reconstructor`.
 
-    `dark`: dark frame of the same exposure. `flat`: frame of even light. `head`: geometry of the light path and sensor,
-    as a head file, the name of a shipped head or scene, or the result of `simulate`. `field_deg`: diameter of the
-    illuminated disc in degrees, with `head`. `method`: name of `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels
-    per sample. `rounds`: largest number of rounds of an iterative method. `settings`: parameters of the method, such as
-    {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the raw is a mosaic of this pattern, "rggb", "bggr",
-    "grbg" or "gbrg"; "none": it is monochrome, whatever a DNG says. `refraction`: False leaves out the eye's
-    refraction, which is estimated with `head`.
+    An option that is left out is chosen from PSF and frame.
+
+    Attributes
+    ----------
+    dark
+        Dark frame of the same exposure, (rows, cols) of the raw.
+    flat
+        Frame of even light, (rows, cols) of the raw.
+    head
+        Geometry of the light path and sensor: a head file, the name of a shipped head or scene, or the
+        result of `simulate`.
+    field_deg
+        Diameter of the illuminated disc in degrees, with `head`.
+    method
+        Name of `methods()`, or FILE.py:NAME.
+    bin
+        bin x bin pixels become one sample.
+    rounds
+        Largest number of rounds of an iterative method.
+    settings
+        Parameters of the method, such as {"tau": 0.1}.
+    budget_s
+        Time limit in seconds.
+    bayer
+        The raw is a mosaic of this pattern, "rggb", "bggr", "grbg" or "gbrg"; "none": it is monochrome,
+        whatever a DNG says.
+    refraction
+        False leaves out the eye's refraction, which is estimated with `head`.
     """
 
     dark: ImageSource
@@ -70,12 +91,35 @@ def reconstruct(
 ) -> FileReconstruction:
     """Return the picture of one raw frame, with its report.
 
-    `raw`: counts, (rows, cols) or (rows, cols, 3), an array, a file (tiff, png, npy, npz, dng), or the raw of a `Pair`.
-    `psf`: image of one bright point, (rows, cols) as `raw`, or the PSFs of a `Pair`; several, or a folder of files, are
-    a stack, of which the most likely one is used. `options`: `ReconstructionOptions`; TypeError for another keyword.
-    `picture` of the result is float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`; `report` is typed;
-    `simulated` is True if `raw` came from `simulate`. FrameError, PsfError or SettingError with a remedy for input that
-    cannot be used. Source: paper, section "Algorithm"; NUMERICS.md.
+    Source: paper, section "Algorithm"; NUMERICS.md.
+
+    Parameters
+    ----------
+    raw
+        Counts, (rows, cols) or (rows, cols, 3): an array, a file (tiff, png, npy, npz, dng), or the raw of
+        a `Pair`.
+    psf
+        Image of one bright point, (rows, cols) as `raw`, or the PSFs of a `Pair`. Several, or a folder of
+        files, are a stack, of which the most likely one is used.
+    **options
+        `ReconstructionOptions`.
+
+    Returns
+    -------
+    FileReconstruction
+        Picture, float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`, and report; marked as
+        simulated if `raw` came from `simulate`.
+
+    Raises
+    ------
+    FrameError
+        A raw, dark or flat frame cannot be used.
+    PsfError
+        A PSF cannot be used.
+    SettingError
+        Options are out of range or contradict each other.
+    TypeError
+        A keyword is no option.
     """
     return Reconstructor(psf, **options)(raw)
 
@@ -83,26 +127,73 @@ def reconstruct(
 class Reconstructor:
     """Reconstruction of many frames with one PSF: what does not depend on the frame is computed once.
 
-    `psf` and `options` as in `reconstruct`. Plans are made for the first frame of a shape (rows, cols) and kept. Use it
-    from one thread at a time. SettingError for options that are out of range or contradict each other.
+    Plans are made for the first frame of a shape (rows, cols) and kept. Use it from one thread at a time.
+
+    Parameters
+    ----------
+    psf
+        PSF or stack of PSFs, as in `reconstruct`.
+    **options
+        `ReconstructionOptions`.
+
+    Raises
+    ------
+    SettingError
+        Options are out of range or contradict each other.
+    TypeError
+        A keyword is no option.
     """
 
     def __init__(self, psf: ImageSource | Sequence[ImageSource], **options: Unpack[ReconstructionOptions]) -> None:
         self._reconstruct = FileReconstructor(_options(psf, options))
 
     def __call__(self, raw: ImageSource) -> FileReconstruction:
-        """Return the picture of one raw frame (rows, cols) or (rows, cols, 3), as `reconstruct` does."""
+        """Return the picture of one raw frame, as `reconstruct` does.
+
+        Parameters
+        ----------
+        raw
+            Counts, (rows, cols) or (rows, cols, 3), as in `reconstruct`.
+
+        Returns
+        -------
+        FileReconstruction
+            Picture, float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`, and report.
+
+        Raises
+        ------
+        FrameError
+            The frame cannot be used.
+        PsfError
+            A PSF does not fit the frame.
+        """
         return self._reconstruct(_raw(raw))
 
 
 class ForwardModel:
     """Forward model y = crop(h * x) of a PSF h: the frame y of an object x, the adjoint, and the noise of a frame.
 
-    An object is float32 of `object_shape`, a frame float32 of `frame_shape`, both (rows, cols) in samples of bin x bin
-    pixels and linear DN. The object is larger than the frame, because light from outside of it reaches the sensor.
-    `shape`: (rows, cols) of the sensor in pixels, by default that of `psf`. `field_radius_px`: radius of the lit disc,
-    outside of which the object is 0; None: not known. PsfError for an invalid PSF, SettingError for an invalid `bin` or
-    radius. Source: paper, equation (1); NUMERICS.md 1.
+    An object is float32 of `object_shape`, a frame float32 of `frame_shape`, both (rows, cols) in samples
+    of bin x bin pixels and linear DN. The object is larger than the frame, because light from outside of it
+    reaches the sensor. Source: paper, equation (1); NUMERICS.md 1.
+
+    Parameters
+    ----------
+    psf
+        Image of one bright point, (rows, cols), an array or a file.
+    shape
+        (rows, cols) of the sensor in pixels; None: that of `psf`.
+    bin
+        bin x bin pixels become one sample.
+    field_radius_px
+        Radius of the lit disc, outside of which the object is 0; None: not known.
+
+    Raises
+    ------
+    PsfError
+        The PSF is invalid.
+    SettingError
+        `bin` or radius is out of range.
     """
 
     def __init__(
@@ -136,35 +227,113 @@ class ForwardModel:
         return self._model.grid.window
 
     def forward(self, x: Image) -> Image:
-        """Return the frame of an object of `object_shape`: float32 of `frame_shape`; FrameError for another shape."""
+        """Return the frame of an object.
+
+        Parameters
+        ----------
+        x
+            Object, float32 of `object_shape`.
+
+        Returns
+        -------
+        Image
+            Frame, float32 of `frame_shape`.
+
+        Raises
+        ------
+        FrameError
+            The object has another shape.
+        """
         _require(x, self.object_shape, "the object")
         return self.crop(self._model.blur(x * self._model.mask))
 
     def adjoint(self, y: Image) -> Image:
-        """Return the adjoint of `forward` for a frame of `frame_shape`: float32 of `object_shape`.
+        """Return the adjoint of `forward` for a frame.
 
-        <forward(x), y> = <x, adjoint(y)> for every x and y. FrameError for another shape.
+        <forward(x), y> = <x, adjoint(y)> for every x and y.
+
+        Parameters
+        ----------
+        y
+            Frame, float32 of `frame_shape`.
+
+        Returns
+        -------
+        Image
+            Object, float32 of `object_shape`.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape.
         """
         adjoint: Image = self._model.blur_adjoint(self.embed(y)) * self._model.mask
         return adjoint
 
     def embed(self, y: Image) -> Image:
-        """Return an object of `object_shape` that is `y` (of `frame_shape`) in front of the sensor, and 0 elsewhere."""
+        """Return the object that is a frame in front of the sensor, and 0 elsewhere.
+
+        Parameters
+        ----------
+        y
+            Frame, float32 of `frame_shape`.
+
+        Returns
+        -------
+        Image
+            Object, float32 of `object_shape`.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape.
+        """
         _require(y, self.frame_shape, "the frame")
         x: Image = np.zeros(self.object_shape, np.float32)
         x[self._model.grid.slices] = y
         return x
 
     def crop(self, x: Image) -> Image:
-        """Return the part of an object of `object_shape` in front of the sensor: float32 of `frame_shape`."""
+        """Return the part of an object in front of the sensor.
+
+        Parameters
+        ----------
+        x
+            Object, float32 of `object_shape`.
+
+        Returns
+        -------
+        Image
+            Frame, float32 of `frame_shape`.
+
+        Raises
+        ------
+        FrameError
+            The object has another shape.
+        """
         _require(x, self.object_shape, "the object")
         return np.ascontiguousarray(x[self._model.grid.slices], np.float32)
 
     def noise_dn(self, y: Image) -> float:
-        """Return the standard deviation of the noise of a frame of `frame_shape`, in DN per sample.
+        """Return the standard deviation of the noise of a frame.
 
-        It is measured at the quarter of the frequencies that the PSF transmits least (NUMERICS.md 2.1); the mean of a
-        frame whose noise is shot noise. FrameError for another shape.
+        It is measured at the quarter of the frequencies that the PSF transmits least (NUMERICS.md 2.1). Shot
+        noise differs over a frame: then it is the mean.
+
+        Parameters
+        ----------
+        y
+            Frame, float32 of `frame_shape`.
+
+        Returns
+        -------
+        float
+            Standard deviation in DN per sample.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape.
         """
         _require(y, self.frame_shape, "the frame")
         window = taper(self.frame_shape)
@@ -180,10 +349,24 @@ class ForwardModel:
 class SimulatedScene:
     """Simulated exposures with their ground truth, all (rows, cols) of the sensor.
 
-    `raw`: counts, uint16, of a type that marks pictures made of it as simulated. `frames`: the frames of the burst, of
-    which `raw` is the first. `truth`: reflectance of the object,
-    float32. `psf`: noise-free PSF of the present eye, float32. `vessels`: mask of the vessels, None if not known.
-    `plan`: decision on every effect, by its name. `write` keeps all of it in files.
+    Attributes
+    ----------
+    name
+        Name of the scene.
+    raw
+        Counts, uint16, of a type that marks pictures made of it as simulated.
+    truth
+        Reflectance of the object, float32.
+    psf
+        Noise-free PSF of the present eye, float32.
+    vessels
+        Mask of the vessels; None if not known.
+    plan
+        Decision on every effect, by its name.
+    frames
+        Frames of the burst, of which `raw` is the first.
+    world
+        Simulated parts that took the frames.
     """
 
     name: str
@@ -196,11 +379,28 @@ class SimulatedScene:
     world: World = field(repr=False)
 
     def explain(self) -> str:
-        """Return the plan as a text table: each effect, simulated or not, and the figure that decided."""
+        """Return the plan as a text table.
+
+        Returns
+        -------
+        str
+            A line for each effect: simulated or not, and the figure that decided.
+        """
         return format_plan(tuple(self.plan.values()))
 
     def write(self, folder: str | Path) -> None:
-        """Write raw.tiff (raw-2.tiff, ...), truth.npy, psf.tiff, vessels.png and plan.json; StoreError on failure."""
+        """Write raw.tiff (raw-2.tiff, ...), truth.npy, psf.tiff, vessels.png and plan.json.
+
+        Parameters
+        ----------
+        folder
+            Folder of the files, made if it does not exist.
+
+        Raises
+        ------
+        StoreError
+            A file cannot be written.
+        """
         scene_files.write(self.world, [np.asarray(one) for one in self.frames], Path(folder))
 
 
@@ -214,10 +414,32 @@ def simulate(
 ) -> SimulatedScene:
     """Return simulated exposures of a scene, with their ground truth.
 
-    `scene`: a scene file, or the name of one of device/sim/scenes/, such as "healthy". Only the effects that could be
-    seen are simulated; `everything`, `only` and `without` (names of effects) overrule the plan. `frames`: number
-    of exposures of one burst, with the same diffuser and eye, and new noise and motion. SettingError for an unknown
-    scene or effect, or for `everything` with `only`; SpecError for an invalid scene file.
+    Only the effects that could be seen are simulated.
+
+    Parameters
+    ----------
+    scene
+        Scene file, or the name of one of device/sim/scenes/, such as "healthy".
+    everything
+        Simulate every effect.
+    only
+        Names of the effects to simulate.
+    without
+        Names of effects to leave out.
+    frames
+        Number of exposures of one burst, with the same diffuser and eye, and new noise and motion.
+
+    Returns
+    -------
+    SimulatedScene
+        Counts, truth and PSF, (rows, cols) of the sensor of the scene.
+
+    Raises
+    ------
+    SettingError
+        The scene or an effect is unknown, or `everything` and `only` are both given.
+    SpecError
+        The scene file is invalid.
     """
     spec = load_head(scene_file(scene))
     world, taken = scene_files.expose(
@@ -253,12 +475,42 @@ def frontier(
 ) -> Frontier:
     """Return accuracy against time of every method, bin and number of rounds, on this machine.
 
-    Either `raw`, `psf` and `truth`, (rows, cols) of one grid (a shift and the intensity are fitted), or `scene`:
-    a scene file, the name of one, or the result of `simulate`. `head` and `field_deg` as in `reconstruct`. `method`:
-    name of `methods()` or FILE.py:NAME, one or several; by default all. `budget_s`: time in seconds within which the
-    instrument chooses. `repeats`: timed runs of each point; their median counts.
-    `progress` is called with one line per step. SettingError if both or neither are given; FrameError for a truth of
-    another shape.
+    Give either `raw`, `psf` and `truth`, or `scene`.
+
+    Parameters
+    ----------
+    raw
+        Counts, (rows, cols) of one grid with `psf` and `truth`.
+    psf
+        Image of one bright point, (rows, cols).
+    truth
+        True object, (rows, cols); a shift and the intensity are fitted.
+    scene
+        Scene file, the name of one, or the result of `simulate`.
+    head
+        Geometry of the light path, as in `reconstruct`.
+    field_deg
+        Diameter of the lit disc in degrees, with `head`.
+    method
+        Name of `methods()` or FILE.py:NAME, one or several; by default all.
+    budget_s
+        Time in seconds within which the instrument chooses.
+    repeats
+        Timed runs of each point, of which the median counts.
+    progress
+        Function that is called with one line per step.
+
+    Returns
+    -------
+    Frontier
+        Points with their choice, time in s and scores.
+
+    Raises
+    ------
+    SettingError
+        Both or neither of frame and scene are given, or `repeats` or `budget_s` is out of range.
+    FrameError
+        The truth has another shape.
     """
     if repeats < 1 or not budget_s > 0:
         raise SettingError("a time is measured at least once, within a budget above 0", "Give repeats and budget_s.")
@@ -278,9 +530,17 @@ def frontier(
 
 
 def methods() -> dict[str, Method]:
-    """Return the built-in and the installed methods by name, each with a sentence, its cost in FFT pairs and settings.
+    """Return the built-in and the installed methods.
 
-    SettingError names the package of a plug-in that cannot be loaded.
+    Returns
+    -------
+    dict of str to Method
+        Methods by name, each with a sentence, its cost in FFT pairs and settings.
+
+    Raises
+    ------
+    SettingError
+        A plug-in cannot be loaded; the message names its package.
     """
     return available_methods()
 

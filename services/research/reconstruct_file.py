@@ -64,9 +64,18 @@ KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up 
 class FileReport(Report):
     """Report of `diffuscope reconstruct`: that of the solver, with what was set and what the files were.
 
-    `solved` is (rows, cols) in samples of the solved frame, `given` the options that replaced a choice of the program
-    (`settings` of the method among them), `psf_channels` the number of PSFs for the channels of the raw (1: one PSF for
-    all), `bayer` the pattern of a mosaic. The other figures of several PSFs are those of the brightest channel.
+    The other figures of several PSFs are those of the brightest channel.
+
+    Attributes
+    ----------
+    solved
+        (rows, cols) in samples of the solved frame.
+    given
+        Options that replaced a choice of the program, `settings` of the method among them.
+    psf_channels
+        Number of PSFs for the channels of the raw; 1: one PSF for all.
+    bayer
+        Pattern of a mosaic; None: the raw is none.
     """
 
     solved: Shape = (0, 0)
@@ -77,29 +86,51 @@ class FileReport(Report):
 
 @dataclass(frozen=True)
 class FileReconstruction(Reconstruction):
-    """Picture of a raw frame, linear float32 in DN, rows x cols (x 3) of the raw, with its report."""
+    """Picture of a raw frame, linear float32 in DN, rows x cols (x 3) of the raw, with its report.
+
+    Attributes
+    ----------
+    report
+        Figures of the solver, what was set, and what the files were.
+    """
 
     report: FileReport
 
     @property
     def summary(self) -> str:
-        """One line: method, bin, size on which the frame was solved, and seconds."""
+        """Summary in one line, with method, bin, size on which the frame was solved, and seconds."""
         report = self.report
         rows, cols = report.solved
         seconds = sum(report.seconds.values())
         return f"{report.method}, bin {report.bin}, solved on {rows} x {cols}, {seconds:.3f} s"
 
     def save(self, path: str | Path) -> None:
-        """Write the picture, marked if simulated: .png scaled for eyes; .tiff or .npy linear float32.
+        """Write the picture, marked if it is simulated.
 
-        SettingError for another ending or a folder that does not exist; StoreError if the file cannot be written.
+        Parameters
+        ----------
+        path
+            File: .png scaled for eyes, .tiff or .npy linear float32.
+
+        Raises
+        ------
+        SettingError
+            The ending is unknown, or the folder does not exist.
+        StoreError
+            The file cannot be written.
         """
         place = Path(path)
         refuse_output(place)
         write_picture(place, self.picture, self.simulated)
 
     def report_json(self) -> str:
-        """Return the report as the text of a JSON file."""
+        """Return the report as the text of a JSON file.
+
+        Returns
+        -------
+        str
+            JSON with the fields of the report, and the mark of a simulated picture.
+        """
         return json.dumps(asdict(self.report) | {KEY: self.simulated}, indent=1) + "\n"
 
 

@@ -21,19 +21,33 @@ VESSELS = (4, 20)  # cycles across the picture: lower is illumination, higher is
 
 @dataclass(frozen=True)
 class Aim:
-    """One instruction code for the operator, and the lit share of the field, 0 to 1 (0 for `noeye` or if unknown)."""
+    """Instruction for the operator.
+
+    Attributes
+    ----------
+    code
+        One code of the page.
+    fill
+        Lit share of the field, 0 to 1; 0 for `noeye` or if unknown.
+    """
 
     code: AimCode
     fill: float
 
 
 class AimingGuide:
-    """Aiming instructions from a sequence of live frames: position of the light, and motion. Not thread-safe.
+    """Aiming instructions from a sequence of live frames: position of the light, and motion.
 
-    Directions are those of the picture: "right" means that the light of the pupil is on the right, and the camera must
-    move there. "closer" and "back" follow the simulated relay: a pupil beyond its focus spreads the light on the
-    sensor. `shot_s` is the exposure time of a capture in seconds, `deg_per_sample` the width of a sample of the
-    pictures; with None motion is ignored.
+    Directions are those of the picture: "right" means that the light of the pupil is on the right, and the
+    camera must move there. "closer" and "back" follow the simulated relay: a pupil beyond its focus spreads
+    the light on the sensor. Not thread-safe.
+
+    Parameters
+    ----------
+    shot_s
+        Exposure time of a capture in s.
+    deg_per_sample
+        Width of a sample of the pictures in degrees; None: motion is ignored.
     """
 
     def __init__(self, shot_s: float, deg_per_sample: float | None) -> None:
@@ -45,10 +59,23 @@ class AimingGuide:
         self.aim = Aim("noeye", 0.0)
 
     def __call__(self, reading: FrameFigures, picture: Image | None, now_s: float) -> Aim:
-        """Return the instruction after one more frame, exposed at `now_s` on the instrument's clock.
+        """Return the instruction after one more frame.
 
-        The code changes at most once in MIN_DISPLAY_S. `reading` holds the figures of the frame, `picture` is its
-        coarse picture, None without a known field.
+        The code changes at most once in MIN_DISPLAY_S.
+
+        Parameters
+        ----------
+        reading
+            Figures of the frame.
+        picture
+            Coarse picture of the frame, (rows, cols); None without a known field.
+        now_s
+            Time of its exposure on the instrument's clock in s.
+
+        Returns
+        -------
+        Aim
+            Code, and lit share of the field.
         """
         self._moved_deg_per_s = self._speed_between_deg_per_s(reading, picture, now_s)
         code = _instruction(reading, (self._moved_deg_per_s or 0.0) > self._most_deg_per_s)
@@ -61,13 +88,33 @@ class AimingGuide:
         return self.aim
 
     def eye_was_visible(self, now_s: float) -> bool:
-        """Return True if the last live frame showed an eye, and is less than MAX_FRAME_GAP_S before `now_s`."""
+        """Return whether the last live frame showed an eye.
+
+        Parameters
+        ----------
+        now_s
+            Present time in s.
+
+        Returns
+        -------
+        bool
+            True if it did, and is less than MAX_FRAME_GAP_S before `now_s`.
+        """
         return self._before is not None and now_s - self._before_s < MAX_FRAME_GAP_S
 
     def speed_deg_per_s(self, now_s: float) -> float | None:
-        """Return the speed of the picture between the last two live frames, degrees per second.
+        """Return the speed of the picture between the last two live frames.
 
-        None if it is unknown, or the last live frame is MAX_FRAME_GAP_S or more before `now_s`.
+        Parameters
+        ----------
+        now_s
+            Present time in s.
+
+        Returns
+        -------
+        float or None
+            Speed in degrees per second; None if it is unknown, or the last live frame is MAX_FRAME_GAP_S or
+            more before `now_s`.
         """
         return self._moved_deg_per_s if self.eye_was_visible(now_s) else None
 

@@ -34,11 +34,20 @@ HALVING_DB = 0.7  # of half the light, measured with one and two frames of six p
 
 @dataclass(frozen=True)
 class ExposureSplit:
-    """Split of each exposure of a press into `parts` of `part_s` seconds each, with its predicted gain.
+    """Split of each exposure of a press into parts, with its predicted gain.
 
-    Without a split `parts` is 1, `part_s` None, and the others are 0, whatever the eye does. `motion_deg`: motion of
-    the eye during one whole exposure. `gain_db`: against exposures that are not split, less what the shorter light
-    loses.
+    Without a split `parts` is 1, `part_s` None, and the others are 0, whatever the eye does.
+
+    Attributes
+    ----------
+    parts
+        Number of parts.
+    motion_deg
+        Motion of the eye during one whole exposure.
+    gain_db
+        Gain over exposures that are not split, less what the shorter light loses.
+    part_s
+        Duration of each part in s.
     """
 
     parts: int = 1
@@ -54,8 +63,12 @@ WHOLE = ExposureSplit()
 class PressLight:
     """What is known of the exposures of the next press from those before.
 
-    `light_e_per_um2_s`: mean light on the sensor per second of exposure; `overhead_s`: what a frame takes longer than
-    its exposure, seconds.
+    Attributes
+    ----------
+    light_e_per_um2_s
+        Mean light on the sensor per second of exposure.
+    overhead_s
+        What a frame takes longer than its exposure, in s.
     """
 
     light_e_per_um2_s: float

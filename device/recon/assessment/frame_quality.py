@@ -74,7 +74,17 @@ class FrameFigures:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a frame for the operator (good or again), its cause (None if good), and the known figures, rounded."""
+    """Verdict on a frame for the operator.
+
+    Attributes
+    ----------
+    word
+        Good or again.
+    code
+        Cause; None if good.
+    numbers
+        Known figures, rounded.
+    """
 
     word: Word
     code: Code | None
@@ -140,9 +150,20 @@ def _is_cut(seen: FrameFigures) -> bool:
 
 
 class FrameQualityGate:
-    """Quality figures of raw frames, planned for one calibration and one sensor shape. One thread at a time.
+    """Quality figures of raw frames, planned for one calibration and one sensor shape.
 
-    Without a known field only saturation and brightness are measured.
+    Without a known field only saturation and brightness are measured. One thread at a time.
+
+    Parameters
+    ----------
+    calibration
+        Calibration of the head.
+    shape
+        (rows, cols) of the sensor in pixels.
+    planner
+        Planner of the FFTs.
+    index
+        Index of the PSF in the calibration.
     """
 
     def __init__(self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int = 0) -> None:
@@ -156,8 +177,24 @@ class FrameQualityGate:
         self._defects = DefectFinder(calibration, shape, index)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> FrameFigures:
-        """Return the figures of a frame (colour: of the brightest channel); `counts` and `dark` as for `Reconstructor`.
-        FrameError for another shape, or if too many pixels are missing but at most MAX_SATURATED are saturated.
+        """Return the figures of a frame, of colour that of the brightest channel.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32, (rows, cols) or (rows, cols, 3).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+
+        Returns
+        -------
+        FrameFigures
+            Figures of the frame.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape, or too many pixels are missing but at most MAX_SATURATED are saturated.
         """
         counts, dark = brightest(counts, dark)
         saturated = float((counts >= self._sensor.white_dn).mean())

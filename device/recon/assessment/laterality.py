@@ -35,10 +35,16 @@ MACULA, MACULA_STEEP = 0.06, 90.0
 
 @dataclass(frozen=True)
 class Laterality:
-    """Laterality of a picture; `eye` is None if uncertain.
+    """Laterality of a picture.
 
-    `confidence` is that of the likelier eye, 0 to 1; `disc` is the (row, col) of its disc in the picture, None without
-    an eye.
+    Attributes
+    ----------
+    eye
+        OD or OS; None if uncertain.
+    confidence
+        Confidence of the likelier eye, 0 to 1.
+    disc
+        (row, col) of its disc in the picture; None without an eye.
     """
 
     eye: Eye | None

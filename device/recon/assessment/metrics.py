@@ -28,7 +28,21 @@ Plane = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of one picture; `vessel_contrast` is None if the vessels are unknown."""
+    """Scores of one picture against its truth.
+
+    Attributes
+    ----------
+    pcc
+        Pearson's correlation coefficient.
+    psnr_db
+        Peak signal-to-noise ratio in dB.
+    ssim
+        Structural similarity.
+    highpass_pcc
+        Correlation of the details.
+    vessel_contrast
+        Contrast of the vessels over that in the truth; None if the vessels are unknown.
+    """
 
     pcc: float
     psnr_db: float
@@ -38,11 +52,23 @@ class Scores:
 
 
 class PictureScorer:
-    """Scoring of pictures against one truth in one region, both (rows, cols).
+    """Scoring of pictures against one truth in one region.
 
-    `detail_px` is the sigma of the blur that the high-pass correlation subtracts, and the reach of a vessel's
-    background; `vessels` marks the pixels of vessels, None if unknown. FrameError if the shapes differ, or the truth
-    has fewer than 16 finite values or no contrast in the region.
+    Parameters
+    ----------
+    truth
+        True object, float32 (rows, cols), NaN where it is unknown.
+    inside
+        Mask of the region, (rows, cols).
+    detail_px
+        Sigma of the blur that the high-pass correlation subtracts, and reach of a vessel's background.
+    vessels
+        Mask of the pixels of vessels; None if unknown.
+
+    Raises
+    ------
+    FrameError
+        The shapes differ, or the truth has fewer than 16 finite values or no contrast in the region.
     """
 
     def __init__(self, truth: Image, inside: Mask, detail_px: float, vessels: Mask | None = None) -> None:
@@ -73,7 +99,23 @@ class PictureScorer:
         return highpass(self.truth, self.inside, self.detail_px)
 
     def __call__(self, picture: Image) -> Scores:
-        """Return the scores of one picture (rows, cols), linear, in any units; FrameError for another shape."""
+        """Return the scores of one picture.
+
+        Parameters
+        ----------
+        picture
+            Linear, (rows, cols), in any units.
+
+        Returns
+        -------
+        Scores
+            Ratios, and the signal-to-noise ratio in dB.
+
+        Raises
+        ------
+        FrameError
+            The picture has another shape.
+        """
         if picture.shape != self._shape:
             raise FrameError(f"a picture of the shape {picture.shape} does not fit a truth of {self._shape}")
         x = np.where(self.inside, picture[self._box], 0).astype(np.float64)

@@ -111,6 +111,15 @@ class PsfConsistency:
     """PSF consistency check of frames of one sensor shape, for one PSF of a calibration.
 
     Run time: 0.4 s for 1080 x 1920, three times that if the first result is FOREIGN.
+
+    Parameters
+    ----------
+    calibration
+        Calibration of the head.
+    shape
+        (rows, cols) of the sensor in pixels.
+    index
+        Index of the PSF in the calibration.
     """
 
     def __init__(self, calibration: Calibration, shape: Pair, index: int = 0) -> None:
@@ -131,15 +140,26 @@ class PsfConsistency:
         self._tapers = [taper(self._grid.window, share) for share in TAPER_SHARES]
 
     def __call__(self, counts: Pixels, scale: float = 1.0, defects: Places | None = None) -> Consistency | None:
-        """Return score, orientation and mirror test of a frame in counts, for the PSF scaled by `scale` (1: as stored).
+        """Return score, orientation and mirror test of a frame.
 
-        The frame is (rows, cols) or (rows, cols, 3). `defects` (flat indices) are filled from their surroundings, see
-        `DefectFinder`. A FOREIGN result is tested again at the best of SCALES; ROTATED, or CONSISTENT with orientation
-        > PROVEN, then replaces it.
+        A FOREIGN result is tested again at the best of SCALES; ROTATED, or CONSISTENT with orientation >
+        PROVEN, then replaces it.
 
-        None if a side of the grid has fewer than MIN_SAMPLES / 2 samples, if the PSF passes too few usable
-        frequencies, or if the result is FOREIGN and either the share of missing pixels is above MAX_MISSING or the
-        mean |Y|^2 is below MIN_SIGNAL times the noise.
+        Parameters
+        ----------
+        counts
+            Counts, (rows, cols) or (rows, cols, 3).
+        scale
+            Scale of the PSF; 1: as stored.
+        defects
+            Flat indices of defective pixels, which are filled from their surroundings, see `DefectFinder`.
+
+        Returns
+        -------
+        Consistency or None
+            None if a side of the grid has fewer than MIN_SAMPLES / 2 samples, if the PSF passes too few usable
+            frequencies, or if the result is FOREIGN and either the share of missing pixels is above MAX_MISSING
+            or the mean |Y|^2 is below MIN_SIGNAL times the noise.
         """
         if min(self._grid.shape) < MIN_SAMPLES // 2:
             return None

@@ -33,11 +33,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PsfMatchResult:
-    """Result for one frame: the score and its standard deviation, the eye's mean sphere M, and the field displacement.
+    """Score of one frame, the eye's mean sphere M, and the displacement of the field.
 
-    M is in dpt, positive for myopia. `field_offset_deg` is the displacement of the illuminated field's centre from the
-    sensor's in degrees (down, right); `field_radius_change_ratio` the relative excess of its radius over the
-    calibrated. Both are None for a field without a sharp edge, in whose frames neither can be found (OPTICS.md 4.9).
+    The field is None where it has no sharp edge, in whose frames it cannot be found (OPTICS.md 4.9).
+
+    Attributes
+    ----------
+    score
+        Match of frame and PSF, 1 for the PSF of the frame.
+    sd
+        Standard deviation of the score.
+    sphere_dpt
+        Mean sphere M in dpt, positive for myopia; the report states the correction, of the other sign.
+    field_offset_deg
+        Displacement of the illuminated field's centre from the sensor's in degrees (down, right).
+    field_radius_change_ratio
+        Relative excess of its radius over the calibrated one.
     """
 
     score: float
@@ -53,9 +64,14 @@ class PsfMatchResult:
 
 
 class PsfMatchTest:
-    """PSF match test of the frames of one head, with the plans of its `RefractionEstimator`.
+    """PSF match test of the frames of one head.
 
-    `has_edge`: whether the lit field has a sharp edge.
+    Parameters
+    ----------
+    refractor
+        Estimator of the refraction, whose plans are used.
+    has_edge
+        True: the lit field has a sharp edge.
     """
 
     def __init__(self, refractor: RefractionEstimator, has_edge: bool = True) -> None:
@@ -70,9 +86,21 @@ class PsfMatchTest:
             self._rim = FieldEdgeFit(self._likelihood.model, bands.low, bands.high, self._likelihood.taper)
 
     def __call__(self, counts: Pixels, dark: Pixels | None, between: Between = lambda: None) -> PsfMatchResult | None:
-        """Return the result for a frame (rows, cols) in counts; None without light or with too few usable frequencies.
+        """Return the result for one frame.
 
-        `between` is called every few milliseconds; its exceptions end the test.
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        between
+            Function that is called every few milliseconds; its exceptions end the test.
+
+        Returns
+        -------
+        PsfMatchResult or None
+            None without light, or with too few usable frequencies.
         """
         refractor = self._refractor
         likelihood = self._likelihood

@@ -17,7 +17,19 @@ MU_CANDIDATES = 10.0 ** np.arange(-8, 1.01, 0.25)
 
 @dataclass(frozen=True)
 class FrequencySample:
-    """Fixed subset of frequencies: flat indices, |H|^2, |D|^2, and a mask of the quarter with least |H|^2."""
+    """Fixed subset of frequencies, in which a solver chooses its parameters.
+
+    Attributes
+    ----------
+    where
+        Flat indices of the frequencies, (n,).
+    power
+        |H|^2, (n,).
+    gradient
+        |D|^2, (n,).
+    stopband
+        Mask of the quarter with least |H|^2, (n,).
+    """
 
     where: NDArray[np.intp]
     power: Energies
@@ -26,7 +38,18 @@ class FrequencySample:
 
     @classmethod
     def of(cls, model: Model) -> "FrequencySample":
-        """Select about SAMPLES frequencies (fewer than twice as many), evenly spread over the half plane, without 0."""
+        """Select frequencies, evenly spread over the half plane, without 0.
+
+        Parameters
+        ----------
+        model
+            Forward model of the grid.
+
+        Returns
+        -------
+        FrequencySample
+            About SAMPLES frequencies, fewer than twice as many.
+        """
         rows, cols = model.otf.shape
         stride = max(1, (rows * cols) // SAMPLES)
         stride += 1 - stride % 2 if cols % 2 == 0 else 0  # even strides over even rows miss columns
@@ -36,22 +59,72 @@ class FrequencySample:
         return cls(where, power, gradient.astype(np.float64), power <= np.quantile(power, 0.25))
 
     def energies(self, spectrum: Spectrum) -> Energies:
-        """Return |Y|^2 at the selected frequencies, for the spectrum Y of the grid."""
+        """Return |Y|^2 at the selected frequencies.
+
+        Parameters
+        ----------
+        spectrum
+            Spectrum Y of the grid, complex64 (rows, cols//2 + 1).
+
+        Returns
+        -------
+        Series
+            |Y|^2, float64 (n,).
+        """
         return np.asarray(np.abs(spectrum.ravel()[self.where].astype(np.complex128)) ** 2)
 
     def passband_power(self, n: int) -> float:
-        """Return the mean |H|^2 of the passband, 0.05 to 0.2 radians per sensor pixel; of all if it is empty."""
+        """Return the mean |H|^2 of the passband, 0.05 to 0.2 radians per sensor pixel.
+
+        Parameters
+        ----------
+        n
+            n x n pixels are one sample.
+
+        Returns
+        -------
+        float
+            Mean |H|^2; of all frequencies if the passband is empty.
+        """
         radians = np.sqrt(self.gradient) / n
         band = (radians > 0.05) & (radians < 0.2)
         return float(self.power[band].mean()) if band.any() else float(self.power.mean())
 
     def misfit(self, reg: Energies, energies: Energies, size: int) -> float:
-        """Return the rms of y - Hx per sample for the solution with `reg`; the grid has `size` samples."""
+        """Return the rms of y - Hx of the regularised solution.
+
+        Parameters
+        ----------
+        reg
+            Regularisation at each frequency, (n,).
+        energies
+            |Y|^2, (n,).
+        size
+            Samples of the grid.
+
+        Returns
+        -------
+        float
+            Rms per sample, in the units of y.
+        """
         phi = reg / (self.power + reg)
         return float(np.sqrt((phi**2 * energies).mean() / size))
 
     def noise_variance(self, energies: Energies, size: int) -> float:
-        """Return the noise variance per sample of a grid of `size` samples, from the stopband."""
+        """Return the variance of the noise, from the stopband.
+
+        Parameters
+        ----------
+        energies
+            |Y|^2, (n,).
+        size
+            Samples of the grid.
+
+        Returns
+        -------
+        float
+            Variance per sample.
+        """
         return float(
             np.median(energies[self.stopband]) / np.log(2) / size
         )  # |Y|^2 of noise is exponential: median = ln 2 mean

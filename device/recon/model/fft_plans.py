@@ -63,12 +63,26 @@ class RealFft:
 class Planner:
     """Factory of FFT plans that keeps FFTW's wisdom in a folder, so that the next start does not measure again.
 
-    One thread by default: two save a fifth of a full-size forward and inverse FFT on an idle machine, and double its
-    duration (small grids: ten times) while another process occupies the second core. The slowest capture matters, not
-    the mean.
+    One thread by default: two save a fifth of a full-size forward and inverse FFT on an idle machine, and
+    double its duration (small grids: ten times) while another process occupies the second core. The slowest
+    capture matters, not the mean.
 
-    Wisdom is valid for one processor and one build of FFTW; the file name is a hash of both. `folder` None keeps none.
-    `effort` is an FFTW planner flag. Several threads may plan at once. SettingError for fewer than one thread.
+    Wisdom is valid for one processor and one build of FFTW; the file name is a hash of both. Several
+    threads may plan at once.
+
+    Parameters
+    ----------
+    folder
+        Folder of the wisdom; None keeps none.
+    threads
+        Threads of each FFT, from 1.
+    effort
+        Planner flag of FFTW.
+
+    Raises
+    ------
+    SettingError
+        Fewer than one thread.
     """
 
     def __init__(self, folder: Path | None, threads: int = 1, effort: str = "FFTW_MEASURE") -> None:
@@ -106,7 +120,20 @@ class Planner:
             log.warning("cannot write FFT wisdom to %s (%s): the next start plans again", file.parent, error)
 
     def plan(self, shape: tuple[int, int]) -> RealFft:
-        """Return a new plan for one shape; write new wisdom to the folder, if set (a failure is only logged)."""
+        """Return a new plan for one shape, and write new wisdom to the folder.
+
+        A failure to write it is only logged.
+
+        Parameters
+        ----------
+        shape
+            (rows, cols) of the image.
+
+        Returns
+        -------
+        RealFft
+            Plan with arrays of its own.
+        """
         with self._lock:
             known = pyfftw.export_wisdom()
             fft = RealFft(shape, self.threads, self.effort)

@@ -16,9 +16,19 @@ from device.values import Calibration, Image, Psf
 class Model:
     """Forward model of one PSF on one grid: planned FFT, OTF, field mask, and the blurred field on the sensor.
 
-    `flat` (the window's shape) is crop(h * mask), the frame of an evenly bright field. `fade` is a taper of the window
-    for light that extends past the sensor's edge; None if it does not. `stored` is the OTF as calibrated, `otf` the one
-    in use. `box` is (top, bottom, left, right) of the field mask; both gradients are those of `gradient_symbol`.
+    `flat` (the window's shape) is crop(h * mask), the frame of an evenly bright field. `fade` is a taper of
+    the window for light that extends past the sensor's edge; None if it does not. `stored` is the OTF as
+    calibrated, `otf` the one in use. `box` is (top, bottom, left, right) of the field mask; both gradients
+    are those of `gradient_symbol`.
+
+    Parameters
+    ----------
+    psf
+        PSF, centred at (rows//2, cols//2).
+    grid
+        Grid of the model.
+    planner
+        Planner of the FFTs.
     """
 
     def __init__(self, psf: Psf, grid: Grid, planner: Planner) -> None:
@@ -31,20 +41,48 @@ class Model:
         self.refocus(self.stored)
 
     def refocus(self, otf: Spectrum) -> None:
-        """Replace the OTF by that of a scaled PSF on the same grid, and recompute `flat` and `fade` (one FFT pair)."""
+        """Replace the OTF by that of a scaled PSF on the same grid, and recompute `flat` and `fade` (one FFT pair).
+
+        Parameters
+        ----------
+        otf
+            OTF, complex64 (rows, cols//2 + 1) of the grid.
+        """
         self.otf = otf
         self.flat = np.ascontiguousarray(self.blur(self.mask)[self.grid.slices])
         self.fade = taper(self.grid.window) if _extends_past_edge(self.flat) else None
 
     def blur(self, image: Image) -> Image:
-        """Return h * x on the grid as a new array."""
+        """Return h * x on the grid.
+
+        Parameters
+        ----------
+        image
+            Object x, float32 of the shape of the grid.
+
+        Returns
+        -------
+        Image
+            New array, float32 of the same shape.
+        """
         self.fft.space[:] = image
         spectrum = self.fft.forward()
         spectrum *= self.otf
         return normalised(self.fft)
 
     def blur_adjoint(self, image: Image) -> Image:
-        """Return the adjoint of `blur`, the correlation with h, as a new array."""
+        """Return the adjoint of `blur`, the correlation with h.
+
+        Parameters
+        ----------
+        image
+            Float32 of the shape of the grid.
+
+        Returns
+        -------
+        Image
+            New array, float32 of the same shape.
+        """
         self.fft.space[:] = image
         spectrum = self.fft.forward()
         spectrum *= np.conj(self.otf)

@@ -19,10 +19,24 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class Grid:
-    """Torus of `shape` samples of n x n sensor pixels each; a part of it, `window` samples, is the frame of the sensor.
+    """Torus of samples, of which a window is the frame of the sensor.
 
-    The window begins at sample `at` of the grid and at pixel `first_px` of the (rows, cols) `sensor`. `radius_samples`
-    is the radius of the field around `centre`; infinite if unknown.
+    Attributes
+    ----------
+    n
+        n x n sensor pixels are one sample.
+    sensor
+        (rows, cols) of the sensor in pixels.
+    shape
+        (rows, cols) of the torus in samples.
+    window
+        (rows, cols) of the window in samples.
+    at
+        First sample (row, col) of the window on the torus.
+    first_px
+        First pixel (row, col) of the window on the sensor.
+    radius_samples
+        Radius of the field around `centre`; infinite if unknown.
     """
 
     n: int
@@ -35,9 +49,23 @@ class Grid:
 
     @classmethod
     def periodic(cls, sensor: Pair, n: int, field_radius_px: float) -> "Grid":
-        """Return the grid whose torus is the sensor itself, n x n pixels per sample, without a margin.
+        """Return the grid whose torus is the sensor itself, without a margin.
 
         Light that leaves at one side re-enters at the opposite side, as in the paper.
+
+        Parameters
+        ----------
+        sensor
+            (rows, cols) of the sensor in pixels.
+        n
+            n x n pixels become one sample.
+        field_radius_px
+            Radius of the lit field; infinite if unknown.
+
+        Returns
+        -------
+        Grid
+            Grid of one sample per n x n pixels.
         """
         shape = (sensor[0] // n, sensor[1] // n)
         return cls(n, sensor, shape, shape, (0, 0), (0, 0), field_radius_px / n)
@@ -46,8 +74,24 @@ class Grid:
     def tight(cls, sensor: Pair, n: int, field_radius_px: float, psf_radius_px: float) -> "Grid":
         """Return the smallest grid with a fast FFT size on which no light that reaches the sensor wraps round.
 
-        With a known field, sensor pixels beyond the blurred field are left out. Without one, the object extends as far
-        as light can reach the sensor.
+        With a known field, sensor pixels beyond the blurred field are left out. Without one, the object extends
+        as far as light can reach the sensor.
+
+        Parameters
+        ----------
+        sensor
+            (rows, cols) of the sensor in pixels.
+        n
+            n x n pixels become one sample.
+        field_radius_px
+            Radius of the lit field; infinite if unknown.
+        psf_radius_px
+            Radius of the PSF's support.
+
+        Returns
+        -------
+        Grid
+            Grid with a margin.
         """
         shape = []
         window = []
@@ -77,7 +121,13 @@ class Grid:
         )
 
     def clear_outside(self, image: Image) -> None:
-        """Set an image on the torus to zero outside the window, in place."""
+        """Set an image on the torus to zero outside the window, in place.
+
+        Parameters
+        ----------
+        image
+            Float32 of `shape`.
+        """
         rows, cols = self.slices
         image[: rows.start], image[rows.stop :] = 0, 0
         image[rows, : cols.start], image[rows, cols.stop :] = 0, 0
@@ -109,7 +159,13 @@ class Grid:
         return spans[0], spans[1]
 
     def field(self) -> Image:
-        """Return the field as a mask on the torus, float32, 0 to 1; all ones if the field is unknown."""
+        """Return the field as a mask on the torus.
+
+        Returns
+        -------
+        Image
+            Float32 of `shape`, 0 to 1; all ones if the field is unknown.
+        """
         return disc(self.shape, self.centre, self.radius_samples)
 
 

@@ -17,9 +17,20 @@ MAX_BAD = 0.3  # share of pixels that may be missing (NUMERICS.md 6.1: at 30 % a
 
 @dataclass(frozen=True)
 class Linear:
-    """Frame in linear DN above dark on a grid's window, (rows, cols), and the good share of each sample, 0 to 1.
+    """Frame in linear DN above dark on a grid's window.
 
-    `mean_dn` is the mean over good pixels; `saturated` and `missing` are shares of all pixels.
+    Attributes
+    ----------
+    y
+        Light in DN, float32 (rows, cols).
+    good
+        Good share of each sample, float32 (rows, cols), 0 to 1.
+    mean_dn
+        Mean over good pixels.
+    saturated
+        Share of saturated pixels.
+    missing
+        Share of missing pixels.
     """
 
     y: Image
@@ -37,9 +48,22 @@ class Linear:
 class Preprocessor:
     """Preprocessing of the frames of one sensor, with the buffers of one grid's window.
 
-    It holds dark level, nonlinearity, flat frame and bad pixels. With `output_buffer` (the window's shape, float32) the
-    linear frame is written to that buffer. FrameError if more than MAX_BAD of the pixels are marked bad, the sensor is
-    smaller than one sample, or a frame of the calibration has another shape than the sensor.
+    It holds dark level, nonlinearity, flat frame and bad pixels.
+
+    Parameters
+    ----------
+    calibration
+        Calibration of the head.
+    grid
+        Grid of the model.
+    output_buffer
+        Buffer of the linear frame, float32 of the window's shape; None: its own.
+
+    Raises
+    ------
+    FrameError
+        More than MAX_BAD of the pixels are marked bad, the sensor is smaller than one sample, or a frame of
+        the calibration has another shape than the sensor.
     """
 
     def __init__(self, calibration: Calibration, grid: Grid, output_buffer: Image | None = None) -> None:
@@ -76,11 +100,29 @@ class Preprocessor:
         self._out = Linear(y, np.empty(grid.window, np.float32), 0.0, 0.0, 0.0)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Linear:
-        """Return one frame (rows, cols), uint16 or float32, in linear DN on the window of the grid.
+        """Return one frame in linear DN on the window of the grid.
 
-        `dark` is the dark frame of this shot; None: the calibration's. Saturated and bad pixels, NaN and `defects`
-        (flat indices) count as missing. The next call overwrites the buffers of the result. FrameError for another
-        shape, or if more than MAX_BAD of the pixels are missing.
+        Saturated and bad pixels, NaN and `defects` count as missing. The next call overwrites the buffers of
+        the result.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        defects
+            Flat indices of defective pixels; None: none.
+
+        Returns
+        -------
+        Linear
+            Light and good share of each sample.
+
+        Raises
+        ------
+        FrameError
+            The frame has another shape, or more than MAX_BAD of its pixels are missing.
         """
         counts = require_shape("frame", counts, self.grid.sensor)
         offset = self.dark if dark is None else require_shape("dark frame", dark, self.grid.sensor)

@@ -12,11 +12,22 @@ Figures = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Parameters and figures of the last frame, for the report; what a solver does not know stays at its default.
+    """Parameters and figures of the last frame, for the report.
 
-    `noise_dn` is the standard deviation of one sample, DN; None if the solver does not estimate it, 0 for a frame
-    without signal. `residual` is the rms residual in units of the noise. `regularisation` has the parameters, most of
-    them chosen from the frame. The keys of `quality` that the report interprets are in `assessment/image_quality.py`.
+    What a solver does not know stays at its default. The keys of `quality` that the report interprets are
+    in `assessment/image_quality.py`.
+
+    Attributes
+    ----------
+    noise_dn
+        Standard deviation of the noise of one sample in DN; None if the solver does not estimate it, 0 for
+        a frame without signal.
+    residual
+        Rms residual in units of the noise.
+    regularisation
+        Parameters, most of them chosen from the frame.
+    quality
+        Figures of frame and picture.
     """
 
     noise_dn: float | None = None

@@ -45,9 +45,23 @@ GRADIENT = Prior(slope=1.0, floor=0.02, psf_error=0.03, subtract_flat=True)
 
 
 class ClosedForm:
-    """Planned closed-form solver; `start` computes the solution and allocates nothing that grows with the image.
+    """Planned closed-form solver.
 
-    SettingError if `mu` is not a positive number; None chooses it by cross-validation.
+    `start` computes the solution and allocates nothing that grows with the image.
+
+    Parameters
+    ----------
+    model
+        Forward model of the stage.
+    prior
+        Prior of the object.
+    mu
+        Weight of the prior relative to |H|^2; None: chosen by cross-validation.
+
+    Raises
+    ------
+    SettingError
+        `mu` is not a positive number.
     """
 
     def __init__(self, model: Model, prior: Prior, mu: float | None = None) -> None:
@@ -61,7 +75,13 @@ class ClosedForm:
         self.refocus()
 
     def configure(self, settings: Settings) -> None:
-        """Use the given `mu` instead of the one that cross-validation chooses."""
+        """Use the given `mu` instead of the one that cross-validation chooses.
+
+        Parameters
+        ----------
+        settings
+            Values by name: `mu`.
+        """
         self.mu = settings.get("mu", self.mu)
 
     def refocus(self) -> None:
@@ -75,10 +95,15 @@ class ClosedForm:
         self._delta = self.psf_error_term / (self.sample.gradient + kernels.MIN_GRADIENT_POWER)
 
     def start(self, frame: Linear) -> None:
-        """Compute the solution except for the flat field; store parameters and figures in `diagnostics`.
+        """Compute the solution except for the flat field, and store parameters and figures in `diagnostics`.
 
-        Parameters: `mu` (relative to |H|^2), `gcv` (score; None for a given mu), `psf_error`, `flat_dn`,
+        They are `mu` (relative to |H|^2), `gcv` (score; None for a given mu), `psf_error`, `flat_dn` and
         `background_dn`.
+
+        Parameters
+        ----------
+        frame
+            Linear frame on the window of the grid.
         """
         model = self.model
         prior = self.prior
@@ -128,7 +153,13 @@ class ClosedForm:
         """Do nothing: the solution has a closed form."""
 
     def finish(self, out: Image) -> None:
-        """Write the picture, with the flat field added again, to `out` (grid, float32) inside the box of the field."""
+        """Write the picture, with the flat field added again, inside the box of the field.
+
+        Parameters
+        ----------
+        out
+            Buffer of the picture, float32 of the shape of the grid.
+        """
         kernels.add_flat(self.model.fft.space, self.model.mask, self._flat_dn, self.model.box, out)
 
     def _weight_of_the_prior(self, energies: Energies) -> tuple[float, float | None]:

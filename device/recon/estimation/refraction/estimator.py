@@ -116,7 +116,13 @@ class Refraction:
 
 @dataclass(frozen=True)
 class NoRefraction:
-    """The refraction of a frame cannot be determined, for this reason (a sentence without a full stop)."""
+    """The refraction of a frame cannot be determined.
+
+    Attributes
+    ----------
+    reason
+        Reason, a sentence without a full stop.
+    """
 
     reason: str
 
@@ -129,8 +135,23 @@ def can_estimate_refraction(calibration: Calibration) -> bool:
 class RefractionEstimator:
     """Estimator of refraction and field edge, planned for one calibration and one sensor shape.
 
-    SettingError if geometry or field are unknown. `index` selects the stored PSF. With `edge_is_known` the edge of the
-    calibration is used as it is.
+    Parameters
+    ----------
+    calibration
+        Calibration of the head.
+    shape
+        (rows, cols) of the sensor in pixels.
+    planner
+        Planner of the FFTs.
+    index
+        Index of the PSF in the calibration.
+    edge_is_known
+        True: the edge of the calibration is used as it is.
+
+    Raises
+    ------
+    SettingError
+        Geometry or field are unknown.
     """
 
     def __init__(
@@ -164,7 +185,22 @@ class RefractionEstimator:
     def find(
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None
     ) -> Refraction | NoRefraction:
-        """Estimate M and the field edge of a frame (rows, cols) in counts; `defects` (flat indices) are left out."""
+        """Estimate the mean sphere M and the field edge of a frame.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        defects
+            Flat indices of defective pixels, which are left out.
+
+        Returns
+        -------
+        Refraction or NoRefraction
+            M in dpt, positive for myopia, and the edge.
+        """
         edges = self._edges
         relaxed = np.zeros(1)
         if edges.band.where.size < MIN_FREQUENCIES:
@@ -197,17 +233,41 @@ class RefractionEstimator:
         )
 
     def add_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
-        """Estimate M, J0 and J45 of the frame for which `find` has just returned `found`."""
+        """Estimate M, J0 and J45 of the last frame of `find`.
+
+        Parameters
+        ----------
+        found
+            Result of `find`.
+
+        Returns
+        -------
+        Refraction or NoRefraction
+            M, J0 and J45 in dpt.
+        """
         try:
             return self._with_cylinder(found)
         except np.linalg.LinAlgError:  # an information matrix without full rank
             return NoRefraction("the frame does not determine a cylinder")
 
     def join(self, found: Refraction, frames: Sequence[Pixels], dark: Pixels | None) -> Refraction | NoRefraction:
-        """Return the refraction of a burst whose first frame gave `found`, and the scatter between its frames.
+        """Return the refraction of a burst, and the scatter between its frames.
 
-        `frames` (rows, cols) in counts begin with the first one. The sd of M grows to the scatter, if that is larger.
-        `found` itself is returned if it has no refined cylinder, or for fewer than MIN_FRAMES frames.
+        The sd of M grows to the scatter, if that is larger.
+
+        Parameters
+        ----------
+        found
+            Refraction of the first frame.
+        frames
+            Counts of all frames, (rows, cols), the first one first.
+        dark
+            Dark frame of all of them; None: that of the calibration.
+
+        Returns
+        -------
+        Refraction or NoRefraction
+            `found` itself if it has no refined cylinder, or for fewer than MIN_FRAMES frames.
         """
         cylinder = found.cylinder
         if cylinder is None or len(frames) < MIN_FRAMES or not self._is_refined:
@@ -292,11 +352,35 @@ class RefractionEstimator:
         return lambda near_dpt: self._edges.near(np.array([near_dpt]), model).nats
 
     def scale(self, m_dpt: float) -> float:
-        """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
+        """Return the scale factor of the PSF for a mean sphere.
+
+        Parameters
+        ----------
+        m_dpt
+            Mean sphere M in dpt, positive for myopia.
+
+        Returns
+        -------
+        float
+            1 for M = 0, below 1 for myopia.
+        """
         return 1 - self.geometry.scale_per_dpt * m_dpt
 
     def otf(self, model: Model, eye: Wavefront) -> Spectrum:
-        """Return the OTF of an eye for a picture on the grid of a model, complex64 (rows, cols//2 + 1)."""
+        """Return the OTF of an eye for a picture on the grid of a model.
+
+        Parameters
+        ----------
+        model
+            Forward model of the picture.
+        eye
+            Wavefront of the eye.
+
+        Returns
+        -------
+        Spectrum
+            OTF, complex64 (rows, cols//2 + 1).
+        """
         return picture_otf(self._edges.likelihood.interpolated_otf, model, transform(self.geometry, *eye))
 
 
