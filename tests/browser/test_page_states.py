@@ -252,9 +252,13 @@ def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: 
 
 def test_warnings_about_a_picture_are_shown_with_it(open_page: Open, real: Real) -> None:
     real.show("saturated")
-    page = aiming(open_page, real)
+    page = aiming(open_page, real, (800, 1280))
     take_picture(page)
-    page.get_by_role("button", name="Details: with a warning").tap()
+    details = page.get_by_role("button", name="Details: with a warning")
+    heights = "title => [title.offsetHeight, parseFloat(getComputedStyle(title).fontSize)]"
+    height, letter = page.locator("#result-title").evaluate(heights)
+    assert height < 2 * letter, "the verdict has one line beside the button"
+    details.tap()
     expect(page.locator("#details")).to_contain_text("of the frame cannot be used (saturated")
 
 

@@ -60,8 +60,16 @@ function card(state, actions, shot) {
 
 function detailsButton(actions, { report }) {
   const warned = report?.warnings?.length;
-  return html`<button class="quiet" type="button" id="open-details" aria-haspopup="dialog" @click=${actions.openDetails}>
-    ${warned ? icon("warn") : nothing} ${t(warned ? "result.details.warn" : "result.details")}
+  const name = warned ? t("result.details.warn") : nothing; // the sign says it in half the width, beside the verdict
+  return html`<button
+    class="quiet"
+    type="button"
+    id="open-details"
+    aria-haspopup="dialog"
+    aria-label=${name}
+    @click=${actions.openDetails}
+  >
+    ${warned ? icon("warn") : nothing} ${t("result.details")}
   </button>`;
 }
 
