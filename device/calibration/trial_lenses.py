@@ -1,9 +1,10 @@
 """Trial lenses before the trainer eye: offset of the refraction, check of its slope and of the cylinder's axis.
 
-Every reading is a refraction without any offset; its nominal value is that of lens and eye together at the pupil
-(`device/optics/trial_lens.py`). The line M = offset + slope * nominal is fitted by weighted least squares; J0 and J45
-have the offset of the readings with spherical lenses, against which the cylinder is judged. The offset is stored and
-subtracted from every refraction; slope and axis are judged only, because no lens of a trial case is known better.
+Every reading is a refraction before a stored offset is subtracted; its nominal value is that of lens and eye together
+at the pupil (`device/optics/trial_lens.py`). The line M = offset + slope * nominal is fitted by weighted least squares;
+J0 and J45 have the offset of the readings with spherical lenses, against which the cylinder is judged. The offset is
+stored and subtracted from every refraction; slope and axis are judged only, because no lens of a trial case is known
+better.
 """
 
 from collections.abc import Sequence

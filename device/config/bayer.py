@@ -2,8 +2,9 @@
 
 Each plane is solved as a channel of its own: its counts are those of the sensor, so that noise and saturation stay as
 measured. A demosaic would mix neighbours, which correlates the noise that the solvers measure in the stopband. The PSF
-is split in the same way. A plane of the frame is then exactly the convolution of the object with the same plane of the
-PSF, so the planes of the picture are not displaced against each other.
+is split in the same way. A plane of the frame is then the convolution of the object with the same plane of the PSF as
+far as the object does not change from one pixel to the next, and the planes of the picture are not displaced against
+each other.
 """
 
 from typing import Any, Literal

@@ -21,7 +21,7 @@ SAVE_MOSAIC = "Save its mosaic as tiff or npy."
 
 @dataclass(frozen=True)
 class Levels:
-    """Pattern, black and white level of a raw image, in stored counts; None if not stated."""
+    """Pattern, black and white level of a raw image, in counts after its linearisation; None if not stated."""
 
     bayer: Bayer | None = None
     black_dn: float | None = None

@@ -306,7 +306,10 @@ def common_white_dn(raws: Sequence[Raw]) -> float:
 
 
 def as_companion(array: Pixels, name: str) -> Image:
-    """Return a dark or flat frame of any number type as float32, in its units, NaN where it is saturated (`as_raw`)."""
+    """Return a dark or flat frame of any number type as float32, in its units.
+
+    NaN where it is saturated (`as_raw`), if more than CHANCE_PIXELS are.
+    """
     is_counts = array.dtype.kind in "ui" and array.min() >= 0 and array.max() <= 65535
     values = array.astype(np.float32)
     raw = as_raw(array if is_counts else values, name)
@@ -344,8 +347,8 @@ def as_psf(array: Pixels, name: str) -> Psf:
 
     A pedestal of mass beta makes every picture (1 + beta) times too bright away from its mean (NUMERICS.md 3.5, item
     6). Therefore the median of the border pixels is subtracted. Negative values stay: clipping would add mass again.
-    The channels of a colour PSF are averaged. PsfError for NaN, infinite values, negative integers, an even or
-    saturated image, or a sum <= 0.
+    The channels of a colour PSF are averaged. PsfError for NaN, infinite values, negative integers, an image of one
+    value (dark or saturated all over), or a sum <= 0.
     """
     return _cleaned(psf_counts(array, name), name)
 

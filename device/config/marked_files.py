@@ -1,4 +1,4 @@
-"""Files of pictures with the mark of those that show no real eye: its only writer and its only reader.
+"""Files of pictures with the mark of those that show no real eye: the one reader, and the one writer of pictures.
 
 Every encoder takes `simulated`, so no picture is written without a decision. Where the mark is:
 

@@ -212,7 +212,8 @@ def _interpreted(page: tifffile.TiffPage, kind: int, values: Pixels, name: str) 
 def looked_up(indices: Pixels, table: NDArray[np.uint16]) -> Pixels:
     """Return the colours of a (n, 3) palette: (rows, cols) if all that are used are grey, else (rows, cols, 3).
 
-    They are uint8 if every entry holds 8 bits (times 257, or times 256), else uint16. ValueError for an index beyond n.
+    They are uint8 if every entry that is used holds 8 bits (times 257, or times 256), else uint16. ValueError for an
+    index beyond n.
     """
     used = np.unique(indices)
     if used[-1] >= len(table):

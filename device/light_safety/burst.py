@@ -1,4 +1,4 @@
-"""Sequences of frames: several frames in one illumination, or a lit and a dark frame of each colour."""
+"""Burst: several frames in one illumination."""
 
 from collections.abc import Callable, Sequence
 
@@ -33,11 +33,11 @@ def burst(
 
     There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
     off. With `parts` above 1 each of the `count` exposures of `whole_s` seconds (None: of all its parts) is split into
-    so many frames, and `shot` is one of them: the lamp is then on no longer than for the whole exposures, each with the
-    overhead of one frame as planned, so that the last frames may be missing. The dose counts for `eyes`, without a
-    visit up to a lower limit. `taken` is called with each frame after its read-out, while the lamp is on: it must
-    return at once. Raises LightCut if the guard has ended the first exposure; a frame that it ended later is left out.
-    The lamp is dark at every exit.
+    so many frames, and `shot` is one of them: the lamp is then on no longer than for `count` whole exposures, with one
+    planned overhead for each of these; read-outs that take longer cost the last frames. The dose counts for `eyes`,
+    whose limit is lower outside a visit. `taken` is called with each frame after its read-out, while the lamp is on: it
+    must return at once. Raises LightCut if the guard has ended the first exposure; a frame that it ended later is left
+    out. The lamp is dark at every exit.
     """
     frames: list[Frame] = []
     with light.on(illumination, eyes, in_visit=in_visit):

@@ -141,7 +141,7 @@ class BurstReconstructor:
         prepared
             Frames that are prepared with this dark frame, by index.
         refract
-            False: the PSF is that of the picture before.
+            False: no refraction is estimated; the PSF is that of the last picture of this reconstructor.
 
         Yields
         ------
@@ -302,8 +302,9 @@ class _Run:
 
 
 def in_one_exposure(made: Reconstruction, light: float) -> Reconstruction:
-    """Return the picture of a sum, `light` times the light of one exposure, with picture and report in DN of that one.
+    """Return the picture of a sum of frames, and its report, in DN of one exposure.
 
+    The sum has `light` times the light of one exposure.
     Its noise is that of the average. Weights of the solver (tau, mu) stay those of the sum.
     """
     report = made.report

@@ -55,9 +55,9 @@ class Placement:
     used
         True: it is part of the montage.
     shift_px
-        Shift in pixels (rows, cols).
+        Shift in pixels (rows, cols); None if it is not used.
     rotation_deg
-        Rotation, counter-clockwise as displayed.
+        Rotation, counter-clockwise as displayed; None if it is not used.
     peak
         Normalised correlation with the picture to which it was registered; None for the first.
     overlap

@@ -46,7 +46,7 @@ def white_ratios(calibration: Calibration, lights_dn_per_s: Mapping[Colour, floa
 
 
 def balanced(picture: Image, field: Image, ratios: Mapping[Colour, float]) -> Image:
-    """Return a picture (rows, cols, 3) with red and blue scaled to a ratio of their means over the field to green's.
+    """Return a picture (rows, cols, 3) whose red and blue have given mean values over the field, relative to green.
 
     `field` is the lit field, (rows, cols) in 0..1. The wanted ratio of a colour is its value in `ratios` (light over
     that of the white card) over the value of green; it is that of an average retina, OVER_GREEN, if either is missing.

@@ -77,9 +77,10 @@ class PlannedCapture(_Part):
     """One capture: raw frame, own dark frame, calibration (digest), and the name of its result.
 
     `raw` is the first frame of the burst, `frames` are the others in their order, then those in other colours.
-    `device`: name of the folder of its calibration archive; `origin`: UUID of the device that took it; both are empty
-    if unknown. `truth` is a picture of the rows and columns of the raw frame to compare with, `before` the earlier
-    picture (of a store: the lit field only), `report` the earlier report in the store; each is a path, or empty.
+    `device`: the calibration archive of its device, by the name of its folder; `origin`: UUID of the device that took
+    it; both are empty if unknown. `truth` is a picture of the rows and columns of the raw frame to compare with,
+    `before` the earlier picture (of a store: the lit field only), `report` the earlier report in the store; each is a
+    path, or empty.
     """
 
     id: str

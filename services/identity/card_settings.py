@@ -1,4 +1,4 @@
-"""Settings of a card: one file `diffuscope.toml` on its first partition, edited on a laptop before the first boot.
+"""Settings of a card: one file `diffuscope.toml` on its first partition, edited on a laptop before any boot.
 
 Each boot reads the file, keeps it on the data partition, and overwrites the Wi-Fi password in it. An invalid file is
 reported and changes nothing.

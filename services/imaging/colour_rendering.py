@@ -1,5 +1,7 @@
 """Rendering of a picture in colour for a display: the lightness of the green picture, the hue of all colours.
 
+The hue itself comes from `device/recon/white_balance.py`.
+
 Blood absorbs green light and hardly any red, so that haemorrhages and vessels stand in green. With the hue of a retina
 most of the light of a display is red, and in one window for all channels they are faint and red is nearly saturated.
 Here the luminance of each displayed pixel is in proportion to the picture in green as it is displayed: what is seen in
@@ -19,9 +21,9 @@ _HIGH = 99.8  # percentile of the lit pixels, as that of the window: the brighte
 def render_colour(picture: Image) -> Image:
     """Return the linear light of the display, 0 to BRIGHTEST, for a linear picture (rows, cols, 3); same shape.
 
-    Show it in the window `DISPLAY`. The luminance of a pixel is that of its green in the window of a picture in green,
-    times one factor for all pixels, the largest at which the hues of the picture fit; the few pixels that do not fit
-    then are less saturated, at the same luminance. A pixel without light in any channel is grey.
+    Show it in the window `picture_files.DISPLAY`. The luminance of a pixel is that of its green in the window of a
+    picture in green, times one factor for all pixels, the largest at which the hues of the picture fit; the few pixels
+    that do not fit then are less saturated, at the same luminance. A pixel without light in any channel is grey.
     """
     low, high = display_window(picture[..., 1])
     luminance = np.clip((picture[..., 1] - np.float32(low)) / np.float32(high - low), 0, 1)

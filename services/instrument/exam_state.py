@@ -42,7 +42,7 @@ class ExamState(Enum):
     STARTING_PRESSED = "FFT plans are made, and a press waits for them", "starting", 1, False
     AIM = "live pictures on request", "aim", 0, True
     PRESSED = "a press waits for its exposure", "busy", 1, False
-    EXPOSING = "lit and dark frame of a press", "busy", 1, False
+    EXPOSING = "frames of a press: dark, lit, other colours", "busy", 1, False
     MAKING = "one exposed capture: reconstruction and storage", "making", 1, True
     MAKING_PRESSED = "one exposed capture, and a press waits for its exposure", "busy", 2, False
     MAKING_EXPOSING = "one exposed capture, suspended during the exposure of a press", "busy", 2, False

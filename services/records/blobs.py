@@ -1,7 +1,4 @@
-"""Reading and writing of whole files of the store: the one place through which the content of its files passes.
-
-A later encryption of the files needs a change here only.
-"""
+"""Reading and writing of whole files of the store: frames, pictures and reports pass here, records do not."""
 
 import errno
 import os

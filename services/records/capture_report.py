@@ -145,8 +145,8 @@ def read_report(content: object) -> CaptureReport:
     """Return the report with this JSON content.
 
     ValueError or KeyError if the content is no JSON object, or if an entry on which the program acts has a wrong type:
-    durations, budget, refraction, verdict, corrections, dose, visit and slot. A wrong type of another entry gives the
-    default, and the stored entry stays in `others`.
+    durations, budget, refraction, verdict, corrections, `dose_j_per_cm2`, visit and slot. A wrong type of another entry
+    gives the default, and the stored entry stays in `others`.
     """
     entries = _object(content)
     verdict = entries.get("verdict")

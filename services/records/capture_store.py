@@ -13,6 +13,7 @@
     quarantine/<id>/              captures found incomplete at an opening of the store; not listed, kept until their
                                   space is needed (quarantine.py)
     snapshots/                    copies of the tables before each migration (snapshots.py)
+    journal/                      captures in progress and their frames (capture_journal.py)
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
 folder that has all files of a capture and no row may have lost its row: the next opening restores the row from the
@@ -256,7 +257,8 @@ class CaptureStore:
     def refuse_light_in_vain(self) -> None:
         """Raise StoreFull or StoreReadOnly if a capture could not be stored: called before its light.
 
-        The dose of the light is written before it, too: that finds a locked database.
+        A locked database is found by `DoseLedgerStore.reserve`, which writes the dose before the light, too.
+        StoreLocked also if room must be made meanwhile.
         """
         schema.refuse_if_read_only(self.engine)
         _refuse_read_only(self.folder, self._captures)

@@ -1,10 +1,11 @@
 """Frames of a press on the disk from their read-out on, so that a kill of the process loses no frame that was taken.
 
-    journal/<id>/raw.tiff, raw-1.tiff, ..., raw-red.tiff, dark.tiff    frames, as the folder of the capture holds them
+    journal/<id>/raw.tiff, raw-1.tiff, ..., raw-red.tiff, dark.tiff    frames in the order of exposure
     journal/<id>/<name>.json                                           note of one frame: SHA-256, length, dose
 
 The note is written after its frame: a frame without a note, or with another SHA-256 than in its note, does not count.
-The store links the files into the folder of the capture (`blobs.write_folder`), so each frame is written once.
+The store links the files into the folder of the capture (`blobs.write_folder`), so each frame is written once; there
+`raw.tiff` is the first frame that can be used.
 """
 
 import hashlib

@@ -17,8 +17,8 @@ MIN_REFRACTION_S = 0.001  # less is the decision against an estimate, not an est
 def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS, thumbnails: Panel | None = None) -> str:
     """Return the SVG of `found`, the result of `frontier.measure_frontier` with `methods`.
 
-    Accuracy against time, `thumbnails`, whose marks have letters, and, if bursts were measured, accuracy against the
-    dose.
+    It shows accuracy against time, `thumbnails` of the points that have letters, and accuracy against the dose if
+    bursts were measured.
     """
     points = drawn_points(found)
     shown = nearest_points(points, found.choice.seconds_median) if thumbnails else ()

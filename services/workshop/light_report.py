@@ -77,9 +77,9 @@ def expected_uw(design: Design) -> float:
 
 
 def expected_beam(design: Design) -> Beam:
-    """Return the beam that the budget expects in an eye that takes in the whole ring, or else the measured one.
+    """Return the beam of a measured ring, times its guard factor; without a measurement that of the light budget.
 
-    The guard factor of a measured ring is in it.
+    In an eye that takes in the whole ring.
     """
     table = design.radiometry
     measured = design.measured

@@ -32,8 +32,8 @@ class MeterReading:
 
     `axis_uw` is the highest power behind a hole of AXIS_HOLE_MM, AXIS_DISTANCE_MM behind the pupil: it gives the
     intensity, and so the highest irradiance of a retina (OPTICS.md 4.9). `waist_mw_per_cm2` is the mean over the
-    brightest disc of 1 mm; `meter` names instrument and date; `fwhm_nm` is the spectrum's width. `scaled` makes it of a
-    reading at less than full drive.
+    brightest disc of 1 mm, at the waist: the narrowest place of the beam; `meter` names instrument and date; `fwhm_nm`
+    is the spectrum's width.
     """
 
     colour: Colour
@@ -82,8 +82,9 @@ def judge(spec: InstrumentSpec, design: Design, reading: MeterReading, limits: L
     """Return the judgement of a reading; `design` is that of the head in the reading's colour.
 
     SpecError for a head without LEDs of its own, or not of that colour. SettingError for a reading that such LEDs
-    cannot give: more power than lossless optics with LEDs twice as bright, more in the waist's disc than such LEDs
-    have, another wavelength; and for one below a thousandth of what is expected, of a lamp that was off.
+    cannot give: more power than lossless optics with LEDs twice as bright, more in the waist than MAX_OF_BEAM times
+    what the reading on the axis gives, another wavelength; and for one below a thousandth of what is expected, of a
+    lamp that was off.
     """
     lamp = (lamps_of(spec) or {}).get(reading.colour)
     if lamp is None:

@@ -37,8 +37,8 @@ class MeterRun:
     """What shines in pulses of `on_s` with equal pauses, and powers behind the hole on the axis while it is lit, uW.
 
     `expected_uw` is that of the light budget. No reading may exceed `assumed_uw`, which the guard counts for this
-    level, or `permitted_uw`, with which an eye has the instrument's limit, by the LEDs' spectrum and with a factor of
-    1.3 for the meter's error.
+    level, or `permitted_uw`, at which an eye would receive the instrument's limit (LEDs' spectrum, factor of 1.3 for
+    the meter's error).
     """
 
     spec: InstrumentSpec

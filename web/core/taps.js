@@ -1,6 +1,6 @@
-// Double taps: of two taps at the same place within 0.4 s only the first counts, on every button. So does a tap at that
-// place within 0.4 s after the buttons have changed, because it was meant for the button that was there before. A tap
-// anywhere else, and the first tap of a page, always counts.
+// Double taps: of two taps at the same place within 0.4 s only the first counts, on every button but those that are meant
+// to be pressed many times (`data-repeat`). A tap at that place within 0.4 s after the buttons have changed does not count
+// either: it was meant for the button that was there before. A tap anywhere else, and the first one of a page, counts.
 
 const DEBOUNCE_MS = 400;
 const SAME_PLACE_PX = 48; // size of the smallest button

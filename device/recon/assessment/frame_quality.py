@@ -184,7 +184,7 @@ class FrameQualityGate:
         counts
             Counts, uint16 or float32, (rows, cols) or (rows, cols, 3).
         dark
-            Dark frame of the same shape; None: that of the calibration.
+            Dark frame of the same shape; None: that of the calibration, for the brightness the black level.
 
         Returns
         -------

@@ -1,4 +1,6 @@
-"""Registration of pictures of one retina: the shift of each picture from a reference, to a fraction of a pixel.
+"""Registration of the frames of a burst, or of colours: the shift of each picture from a reference, sub-pixel.
+
+Pictures of several gaze directions are registered by `masked_correlation.py`.
 
 The lit field does not move with the eye, so that raw frames correlate at shift 0. Each picture is therefore divided by
 its local mean, windowed inside the field, band-passed and correlated; the peak is refined with a matrix DFT (Guizar-
