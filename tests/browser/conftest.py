@@ -71,7 +71,7 @@ class Server:
         place = {"PYTHONPATH": str(self.first_on_path)} if self.first_on_path else {}
         self._process = subprocess.Popen(command, cwd=ROOT, env=os.environ | place, stdout=self._log, stderr=self._log)
 
-    def wait_until_ready(self, limit_s: float = 120) -> None:
+    def wait_until_ready(self, limit_s: float = 300) -> None:
         end = time.monotonic() + limit_s
         while time.monotonic() < end:
             assert self._process is not None

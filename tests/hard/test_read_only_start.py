@@ -65,7 +65,7 @@ def running(folder: Path, data: Path, prefix: tuple[str, ...]) -> Iterator[httpx
         process = subprocess.Popen(words, cwd=ROOT, stdout=log, stderr=log)
         undo.callback(process.kill)
         client = undo.enter_context(closing(httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)))
-        end_s = time.monotonic() + 120
+        end_s = time.monotonic() + 300
         while not aims(client):
             assert process.poll() is None, (folder / "log").read_text()
             assert time.monotonic() < end_s

@@ -291,7 +291,7 @@ def technician_requests(rig: Rig, path: str) -> Callable[..., httpx.Response]:
     return request
 
 
-def until(holds: Callable[[], bool], patience_s: float = 15.0) -> None:
+def until(holds: Callable[[], bool], patience_s: float = 60.0) -> None:
     """Wait in real time for a condition set by another thread."""
     end = time.monotonic() + patience_s
     while not holds():

@@ -44,7 +44,7 @@ CHIPS = '\n[bus]\nbackend = "sim"\nthermometer = 0x48\nmemory = 0x50\n'
 STANDS = ("cap", "screen", "point")
 
 
-def until(holds: Callable[[], bool], patience_s: float = 30.0) -> None:
+def until(holds: Callable[[], bool], patience_s: float = 60.0) -> None:
     """Wait for the thread that owns the head; each check is a request."""
     end = time.monotonic() + patience_s
     while not holds():

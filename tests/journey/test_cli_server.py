@@ -46,7 +46,7 @@ class Server:
         return self._log.read_text()
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
-        end = time.monotonic() + 90
+        end = time.monotonic() + 300
         while time.monotonic() < end:
             assert process.poll() is None, self.output()
             try:

@@ -28,7 +28,7 @@ from tests.project_files import nodes, python_files, text
 from tests.simulated import SMALL_SCENE, small_head_toml
 
 ROOT = HEAD.parents[2]
-READY_S = 60.0
+READY_S = 300.0  # TimeoutStartSec of the unit
 TOO_BRIGHT = "\n".join(
     ['[light.radiometry]\nmeasured = "in a test"\nguard_factor = 10']
     + [
