@@ -54,11 +54,17 @@ def key() -> BackupKey:
     return key_for_recipients([RECIPIENT])
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Path:
-    folder = filled_store(tmp_path / "old", with_log=True)
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = filled_store(tmp_path_factory.mktemp("filled"), with_log=True)
     (folder / KEY_FILE).unlink()
     return folder
+
+
+@pytest.fixture
+def store(filled: Path, tmp_path: Path) -> Path:
+    """A copy of one store for each test: to fill it takes a second."""
+    return shutil.copytree(filled, tmp_path / "old")
 
 
 @pytest.fixture
