@@ -131,6 +131,14 @@ def head_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def served_head(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a head for servers in a process of their own: with half the rows and columns they start sooner."""
+    path = tmp_path_factory.mktemp("head") / "served.toml"
+    path.write_text(small_head_toml("Served simulated head", summed=2))
+    return path
+
+
+@pytest.fixture(scope="session")
 def spec(head_file: Path) -> InstrumentSpec:
     return load_head(head_file)
 

@@ -81,9 +81,9 @@ ANSWERS = {"age": 54, "consent": "agreed"}
 
 
 def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
-    head_file: Path, environment: dict[str, str], tmp_path: Path, diffuscope: Diffuscope
+    served_head: Path, environment: dict[str, str], tmp_path: Path, diffuscope: Diffuscope
 ) -> None:
-    server = Server(head_file, tmp_path / "data", environment)
+    server = Server(served_head, tmp_path / "data", environment)
     with server.running() as process:
         visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
         server.ask("PATCH", f"/api/visits/{visit}", {"key": "1" * 16, "field": "age", "value": 54})
@@ -91,14 +91,14 @@ def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
         where = {"visit": visit, "key": "2" * 16}
         kept = [server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", **where})["id"]]
         kept.append(server.ask("POST", "/api/captures", {"eye": "OS"})["id"])
-        second = diffuscope("run", "--head", head_file, "--port", server.port, "--data", tmp_path / "other")
+        second = diffuscope("run", "--head", served_head, "--port", server.port, "--data", tmp_path / "other")
         assert second.returncode == 2
         assert "cannot be served" in second.stderr
         assert f"--port {server.port + 1}" in second.stderr
         assert not (tmp_path / "other").exists()
         wrong = tmp_path / "protocol.toml"
         wrong.write_text("retakes = 2\n")
-        third = diffuscope("run", "--head", head_file, "--protocol", wrong)
+        third = diffuscope("run", "--head", served_head, "--protocol", wrong)
         assert (third.returncode, "protocol.toml" in third.stderr) == (2, True)
         with ThreadPoolExecutor(1) as aside:
             pressed = aside.submit(server.ask, "POST", "/api/captures", {"eye": "OD"})
@@ -117,7 +117,7 @@ def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
         for id in listed:  # includes a third capture if the kill came after its storage
             for name in ("raw.tiff", "picture.png", "quick.jpg", "report.json"):
                 assert server.ask("GET", f"/api/captures/{id}/{name}")
-            assert tifffile.imread(BytesIO(server.ask("GET", f"/api/captures/{id}/raw.tiff"))).shape == (270, 480)
+            assert tifffile.imread(BytesIO(server.ask("GET", f"/api/captures/{id}/raw.tiff"))).shape == (136, 240)
         assert server.ask("POST", "/api/captures", {"eye": "OD"})["id"] not in listed
         with ExitStack() as undo:
             streams = [undo.enter_context(server.listening()) for _ in range(3)]

@@ -203,7 +203,7 @@ def test_sigkill_between_frames_and_during_the_reconstruction(environment: dict[
     for all of them.
     """
     head, data = tmp_path / "slow.toml", tmp_path / "data"
-    slow = small_head_toml("Small slow head", exposure_s=0.8)
+    slow = small_head_toml("Small slow head", summed=2, exposure_s=0.8)
     head.write_text(slow.replace("[light]", "[light]\nmax_on_s = 10"))
     server = Server(head, data, environment)
     with server.running() as process:

@@ -18,9 +18,9 @@ def stop(process: subprocess.Popen[bytes], number: signal.Signals) -> int:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_sigterm_and_sigint_exit_with_0_and_checkpoint_the_database(
-    head_file: Path, environment: dict[str, str], tmp_path: Path, number: signal.Signals
+    served_head: Path, environment: dict[str, str], tmp_path: Path, number: signal.Signals
 ) -> None:
-    server, data = Server(head_file, tmp_path / "data", environment), tmp_path / "data"
+    server, data = Server(served_head, tmp_path / "data", environment), tmp_path / "data"
     with server.running() as process:
         visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
         server.ask("PATCH", f"/api/visits/{visit}", {"key": "f" * 16, "field": "consent", "value": "agreed"})

@@ -43,9 +43,9 @@ def sending(server: Server) -> dict[str, int]:
 
 
 def test_each_visit_is_uploaded_once_and_complete_after_a_kill_during_the_upload(
-    receiver: Receiver, head_file: Path, environment: dict[str, str], tmp_path: Path
+    receiver: Receiver, served_head: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
-    server = Server(head_file, tmp_path / "data", environment, "--send", str(tmp_path / "send.toml"))
+    server = Server(served_head, tmp_path / "data", environment, "--send", str(tmp_path / "send.toml"))
     with server.running() as process:
         until(lambda: server.ask("GET", "/api/status")["state"] == "aim", 120)
         finished(server, 0)

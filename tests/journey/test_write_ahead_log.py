@@ -60,10 +60,10 @@ def complete_captures(data: Path) -> set[str]:
 
 
 def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
-    head_file: Path, environment: dict[str, str], tmp_path: Path
+    served_head: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
     data, random_source = tmp_path / "data", random.Random(16)
-    kept = captures_before_a_kill(Server(head_file, data, environment))
+    kept = captures_before_a_kill(Server(served_head, data, environment))
     log = data / "store.sqlite-wal"
     assert log.stat().st_size > 0, "the log is empty, so the test shows nothing"
     spent = spent_of(shutil.copytree(data, tmp_path / "as-it-was"))
@@ -72,7 +72,7 @@ def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
         folder = shutil.copytree(data, tmp_path / f"{turn}")
         flipped = flip(folder / log.name, random_source)
         if turn < SERVED:
-            with Server(head_file, folder, environment).running():
+            with Server(served_head, folder, environment).running():
                 pass
         with CaptureStore(folder, reserve_bytes=0) as store:
             listed = {one.id for one in store.captures()}
@@ -92,16 +92,18 @@ def spent_of(folder: Path) -> dict[str, float]:
         return {"OD": ledger.spent_j_per_cm2("OD"), "OS": ledger.spent_j_per_cm2("OS")}
 
 
-def test_health_counts_orphans_and_gives_a_remedy(head_file: Path, environment: dict[str, str], tmp_path: Path) -> None:
+def test_health_counts_orphans_and_gives_a_remedy(
+    served_head: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
     """The copy has captures/ and store.sqlite of a killed instrument; health counts the one without a record."""
-    server, data, copy = Server(head_file, tmp_path / "data", environment), tmp_path / "data", tmp_path / "copy"
+    server, data, copy = Server(served_head, tmp_path / "data", environment), tmp_path / "data", tmp_path / "copy"
     kept = captures_before_a_kill(server)
     shutil.copytree(data / "captures", copy / "captures")
     shutil.copyfile(data / "store.sqlite", copy / "store.sqlite")
     (copy / "captures" / kept[0] / RECORD).unlink()  # as a release before the record wrote it
-    with Server(head_file, copy, environment).running():
+    with Server(served_head, copy, environment).running():
         pass  # a start, and a kill
-    again = Server(head_file, copy, environment)
+    again = Server(served_head, copy, environment)
     with again.running() as process:
         checks = {check["name"]: check for check in again.ask("GET", "/api/health")["checks"]}
         assert set(again.listed()) == set(kept[1:])
