@@ -24,8 +24,8 @@ class FailsInRed:
 
     def expose(self, shot: ExposureSettings) -> Frame:
         """Return a frame; CameraStalled in red light."""
-        glow = self._world.illumination
-        if glow is not None and glow.colour == "red" and shot.exposure_s > self._shortest_s:
+        illumination = self._world.illumination
+        if illumination is not None and illumination.colour == "red" and shot.exposure_s > self._shortest_s:
             self.reds += 1
             if self.fails:
                 raise CameraStalled("no frame came")

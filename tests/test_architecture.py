@@ -680,7 +680,7 @@ BROKEN: list[tuple[Finder, str]] = [
     (folder_lists, "sorted(folder.glob('*.tiff'))"),
     (folder_lists, "import os\nos.walk('.')"),
     (raw_lamps, "def f(self):\n    return self._lamp(None)"),
-    (raw_lamps, "def f(world):\n    with SimLight(world).on(glow): ..."),
+    (raw_lamps, "def f(world):\n    with SimLight(world).on(illumination): ..."),
     (leftovers, "# TO" + "DO: later"),
     (leftovers, "see " + "/wo" + "rk/main"),
     (workplace_words, "from " + "shared" + "/knowledge"),

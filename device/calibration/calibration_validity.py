@@ -70,8 +70,8 @@ def _other_mode(calibration: Calibration, known: Provenance, camera: CameraSpec)
     """Return the first difference in shape, pitch, white or black level, or dark exposure as a sentence; else None."""
     sensor = calibration.sensor
     geometry = calibration.geometry
-    maps = [one for one in (calibration.dark_dn, calibration.flat, calibration.bad) if one is not None]
-    for rows, cols in (one.shape for one in (*calibration.psfs, *maps)):
+    maps = [array for array in (calibration.dark_dn, calibration.flat, calibration.bad) if array is not None]
+    for rows, cols in (array.shape for array in (*calibration.psfs, *maps)):
         if (rows, cols) != (camera.rows, camera.cols):
             return f"has {rows} x {cols} pixels, the head's file {camera.rows} x {camera.cols}"
     if geometry is not None and abs(geometry.pitch_um / camera.pitch_um - 1) > PITCH_SHARE:

@@ -77,12 +77,16 @@ class LedReadings(Table):
     def _agree(self) -> "LedReadings":
         """Raise ValueError for a duplicate reading, or for an LED far weaker than the others of its colour."""
         seen = set()
-        for one in self.led:
-            if (one.led, one.colour) in seen:
-                raise ValueError(f"LED {one.led} in {one.colour} stands there twice")
-            seen.add((one.led, one.colour))
+        for reading in self.led:
+            if (reading.led, reading.colour) in seen:
+                raise ValueError(f"LED {reading.led} in {reading.colour} stands there twice")
+            seen.add((reading.led, reading.colour))
         for colour in COLOURS:
-            powers = {one.led: one.power_mw for one in self.led if one.colour == colour and one.power_mw is not None}
+            powers = {
+                reading.led: reading.power_mw
+                for reading in self.led
+                if reading.colour == colour and reading.power_mw is not None
+            }
             if powers and min(powers.values()) < MIN_POWER_SHARE * max(powers.values()):
                 weak = min(powers, key=lambda led: powers[led])
                 raise ValueError(
@@ -95,9 +99,9 @@ class LedReadings(Table):
     def figures(self) -> dict[str, float]:
         """Return the guard factor and all known readings as figures of the manifest, such as `led_19_green_mw`."""
         found = {"leds_guard_factor": self.guard_factor}
-        for one in self.led:
-            name = f"led_{one.led}_{one.colour}"
-            values = {"nm": one.peak_nm, "mw": one.power_mw, "waist_mw_per_cm2": one.waist_mw_per_cm2}
+        for reading in self.led:
+            name = f"led_{reading.led}_{reading.colour}"
+            values = {"nm": reading.peak_nm, "mw": reading.power_mw, "waist_mw_per_cm2": reading.waist_mw_per_cm2}
             found |= {f"{name}_{key}": value for key, value in values.items() if value is not None}
         return found
 
@@ -109,7 +113,7 @@ def load_led_readings(path: Path, spec: InstrumentSpec) -> LedReadings:
     if chain is None:
         raise SpecError(f"{spec.name} has no table [light.chain], so it has no LEDs to be measured one by one")
     leds = ring(chain)
-    if strange := sorted({one.led for one in read.led} - set(leds)):
+    if strange := sorted({reading.led for reading in read.led} - set(leds)):
         raise SpecError(
             f"{path}: LED {strange[0]} is not on the ring of {spec.name}",
             f"Its LEDs are {', '.join(map(str, leds))}.",
@@ -123,7 +127,9 @@ def missing_readings(read: LedReadings, spec: InstrumentSpec) -> list[str]:
     messages = []
     for colour in COLOURS:
         known = {
-            one.led for one in read.led if one.colour == colour and None not in (one.power_mw, one.waist_mw_per_cm2)
+            reading.led
+            for reading in read.led
+            if reading.colour == colour and None not in (reading.power_mw, reading.waist_mw_per_cm2)
         }
         if missing := [led for led in (ring(chain) if chain else ()) if led not in known]:
             which = "no LED" if not known else f"not LED {', '.join(map(str, missing))}"
@@ -171,7 +177,7 @@ def _stored_reading(figures: Mapping[str, float], led: int, colour: Colour) -> _
 
 def _trims(readings: list[_StoredReading | None]) -> tuple[float, ...] | None:
     """Return the drive (0 to 1) of each LED that makes all as bright as the weakest; None if any power is unknown."""
-    powers = [one.mw for one in readings if one is not None and one.mw is not None]
+    powers = [reading.mw for reading in readings if reading is not None and reading.mw is not None]
     return tuple(min(powers) / power for power in powers) if len(powers) == len(readings) else None
 
 
@@ -181,7 +187,7 @@ def _beam(readings: list[_StoredReading | None], trims: tuple[float, ...], field
     The shortest wavelength counts for all LEDs and the waist irradiances are added: the worst case of the readings. A
     power does not say how the light is spread over the field, so the narrowest cap within its tolerances is assumed.
     """
-    known = [(one.nm, one.mw, one.waist_mw_per_cm2) for one in readings if one is not None]
+    known = [(reading.nm, reading.mw, reading.waist_mw_per_cm2) for reading in readings if reading is not None]
     powers = [mw for _, mw, _ in known if mw is not None]
     waists = [waist for _, _, waist in known if waist is not None]
     if not len(powers) == len(waists) == len(trims):

@@ -135,7 +135,7 @@ def verify_export(whole: bytes, name: str, trusted: tuple[Signer, ...]) -> tuple
     magic, mark, claimed_name, signature, packed = _split_header(whole, name)
     if magic != f"{MAGIC} {FORMAT}":
         raise CalibrationFormat(f"{name} says '{magic}', and what is read here is '{MAGIC} {FORMAT}'")
-    signer = next((one for one in trusted if one.fingerprint == mark), None)
+    signer = next((key for key in trusted if key.fingerprint == mark), None)
     if signer is None:
         raise CalibrationUntrusted(
             f"{name} is signed with a key that is not trusted here: it names '{claimed_name}', key {mark[:16]}",
@@ -186,13 +186,13 @@ def _unzip(packed: bytes, name: str) -> dict[str, bytes]:
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             held = archive.infolist()
-            if len(held) > MAX_FILES or len({one.filename for one in held}) < len(held):
+            if len(held) > MAX_FILES or len({member.filename for member in held}) < len(held):
                 raise CalibrationDamaged(f"{name} holds more files than a calibration has", RETRY_REMEDY)
-            if any(one.compress_type != zipfile.ZIP_STORED for one in held):
+            if any(member.compress_type != zipfile.ZIP_STORED for member in held):
                 raise CalibrationDamaged(f"{name} holds compressed files, as no calibration does", RETRY_REMEDY)
-            if sum(one.file_size for one in held) > len(packed):
+            if sum(member.file_size for member in held) > len(packed):
                 raise CalibrationDamaged(f"{name} promises more bytes than it has", RETRY_REMEDY)
-            return {one.filename: archive.read(one) for one in held}
+            return {member.filename: archive.read(member) for member in held}
     except (zipfile.BadZipFile, ValueError, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise CalibrationDamaged(f"{name} was signed, but holds no files: {error}", RETRY_REMEDY) from error
 

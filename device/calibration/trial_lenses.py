@@ -108,7 +108,7 @@ def fit_trial_lenses(readings: Sequence[LensReading], vertex_mm: float, eye: Pow
     cylinder, or values that are no numbers. Limits are judged by `refuse_beyond_limits`, so that a table can be shown.
     """
     _refuse_unusable(readings)
-    nominals = tuple(correction_behind(one.lens, vertex_mm, eye) for one in readings)
+    nominals = tuple(correction_behind(reading.lens, vertex_mm, eye) for reading in readings)
     line = _fit_line(readings, nominals)
     spherical = [pair for pair in zip(readings, nominals, strict=True) if not pair[0].lens.cylinder_dpt]
     (j0_dpt, j0_sd), (j45_dpt, j45_sd) = (_mean_offset(spherical, component) for component in (1, 2))
@@ -136,26 +136,29 @@ def refuse_beyond_limits(fit: TrialLensFit) -> None:
 
 
 def _refuse_unusable(readings: Sequence[LensReading]) -> None:
-    spheres = {one.lens.sphere_dpt for one in readings if not one.lens.cylinder_dpt}
-    cylinders = sum(1 for one in readings if one.lens.cylinder_dpt)
+    spheres = {reading.lens.sphere_dpt for reading in readings if not reading.lens.cylinder_dpt}
+    cylinders = sum(1 for reading in readings if reading.lens.cylinder_dpt)
     if len(spheres) < MIN_SPHERES or cylinders != 1:
         raise CalibrationRefused(
             f"{len(spheres)} spheres and {cylinders} cylinders were read, instead of {MIN_SPHERES} or more and 1",
             "Show every lens that is asked for, once.",
         )
-    for one in readings:
-        if not all(map(isfinite, (*one.found, *one.sds))) or min(one.sds) <= 0:
+    for reading in readings:
+        if not all(map(isfinite, (*reading.found, *reading.sds))) or min(reading.sds) <= 0:
             raise CalibrationRefused(
-                f"with {one.lens.label} the refraction is no number with a standard deviation: {tuple(one.found)}",
+                f"with {reading.lens.label} the refraction is no number with a standard deviation: "
+                f"{tuple(reading.found)}",
                 "Show this lens again.",
             )
 
 
 def _fit_line(readings: Sequence[LensReading], nominals: Sequence[PowerVector]) -> _Line:
     """Return the line of M; its sds grow with the scatter of the readings if that is larger than their own sds."""
-    x, y = (np.array([one.m_dpt for one in values]) for values in (nominals, [one.found for one in readings]))
-    lens_sds = np.array([LENS_SD_DPT if any(one.lens) else 0.0 for one in readings])
-    sds = np.sqrt([one.sds.m_dpt**2 for one in readings] + lens_sds**2 + (VERTEX_SD_MM / 1000 * x**2) ** 2)
+    x, y = (
+        np.array([value.m_dpt for value in values]) for values in (nominals, [reading.found for reading in readings])
+    )
+    lens_sds = np.array([LENS_SD_DPT if any(reading.lens) else 0.0 for reading in readings])
+    sds = np.sqrt([reading.sds.m_dpt**2 for reading in readings] + lens_sds**2 + (VERTEX_SD_MM / 1000 * x**2) ** 2)
     terms = np.stack([np.ones_like(x), x], axis=1) / sds[:, None]
     covariance = np.linalg.inv(terms.T @ terms)
     offset_dpt, slope = covariance @ (terms.T @ (y / sds))
@@ -167,24 +170,26 @@ def _fit_line(readings: Sequence[LensReading], nominals: Sequence[PowerVector]) 
 
 def _mean_offset(pairs: Sequence[tuple[LensReading, PowerVector]], component: int) -> tuple[float, float]:
     """Return the weighted mean of measured minus nominal of one component, and its sd, dpt."""
-    off = np.array([one.found[component] - nominal[component] for one, nominal in pairs])
-    weights = np.array([one.sds[component] ** -2 for one, _ in pairs])
+    off = np.array([reading.found[component] - nominal[component] for reading, nominal in pairs])
+    weights = np.array([reading.sds[component] ** -2 for reading, _ in pairs])
     mean = float((weights * off).sum() / weights.sum())
     scatter = float((weights * (off - mean) ** 2).sum()) / max(len(pairs) - 1, 1)
     return mean, sqrt(max(scatter, 1.0) / float(weights.sum()))
 
 
 def _cylinder_errors(
-    one: LensReading, nominal: PowerVector, offset: RefractionOffset, eye: PowerVector
+    reading: LensReading, nominal: PowerVector, offset: RefractionOffset, eye: PowerVector
 ) -> tuple[float, float, float]:
     """Return cylinder (dpt) and axis (degrees) of the reading minus nominal, and the sd of the axis.
 
     Compared is what the lens adds to the offset and to the eye's own cylinder.
     """
-    seen = np.array([one.found.j0_dpt - offset.j0_dpt - eye.j0_dpt, one.found.j45_dpt - offset.j45_dpt - eye.j45_dpt])
+    seen = np.array(
+        [reading.found.j0_dpt - offset.j0_dpt - eye.j0_dpt, reading.found.j45_dpt - offset.j45_dpt - eye.j45_dpt]
+    )
     due = np.array([nominal.j0_dpt - eye.j0_dpt, nominal.j45_dpt - eye.j45_dpt])
     turned_deg = degrees(atan2(seen[1], seen[0]) - atan2(due[1], due[0])) / 2
-    sd_dpt = hypot(max(one.sds[1:]), max(offset.j0_sd_dpt, offset.j45_sd_dpt))
+    sd_dpt = hypot(max(reading.sds[1:]), max(offset.j0_sd_dpt, offset.j45_sd_dpt))
     return 2 * (hypot(*seen) - hypot(*due)), (turned_deg + 90) % 180 - 90, degrees(sd_dpt / hypot(*due)) / 2
 
 

@@ -34,7 +34,7 @@ class CardFrames:
 
 def white_reference(frames: Mapping[Colour, CardFrames], calibration: Calibration) -> WhiteReference:
     """Return the light of the card in each colour; CalibrationRefused with the reason for frames that are no white."""
-    lights = {colour: _light_dn_per_s(colour, one, calibration) for colour, one in frames.items()}
+    lights = {colour: _light_dn_per_s(colour, card_frames, calibration) for colour, card_frames in frames.items()}
     low = min(lights, key=lights.__getitem__)
     high = max(lights, key=lights.__getitem__)
     if lights[high] > MAX_RATIO * lights[low]:

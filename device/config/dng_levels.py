@@ -36,7 +36,7 @@ def tag_values(tag: tifffile.TiffTag | None) -> tuple[float, ...]:
     if tag is None:
         return ()
     value = tag.value  # a number, bytes, or a sequence of numbers
-    values = tuple(float(one) for one in (value if isinstance(value, bytes) else np.ravel(value)))
+    values = tuple(float(number) for number in (value if isinstance(value, bytes) else np.ravel(value)))
     if tag.dtype in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
         return tuple(top / bottom for top, bottom in zip(values[::2], values[1::2], strict=True))
     return values
@@ -83,7 +83,7 @@ def _white(page: tifffile.TiffPage, name: str) -> float | None:
     """Return the saturation level; None if not stated."""
     white = tag_values(page.tags.get("WhiteLevel"))
     if len(set(white)) > 1 or min(white, default=1) <= 0:
-        raise FrameError(f"{name} has the WhiteLevel {', '.join(f'{one:g}' for one in white)}", SAVE_MOSAIC)
+        raise FrameError(f"{name} has the WhiteLevel {', '.join(f'{level:g}' for level in white)}", SAVE_MOSAIC)
     return white[0] if white else None
 
 
@@ -144,7 +144,9 @@ def _whole(page: tifffile.TiffPage, tag: str, default: tuple[int, ...], name: st
     """Return the whole numbers of a tag; FrameError for fractions, or for another number of values."""
     values = tag_values(page.tags.get(tag)) or default
     if len(values) != len(default) or any(value != int(value) for value in values):
-        raise FrameError(f"{name} has {tag} {', '.join(f'{one:g}' for one in values)}, which is not read", SAVE_MOSAIC)
+        raise FrameError(
+            f"{name} has {tag} {', '.join(f'{number:g}' for number in values)}, which is not read", SAVE_MOSAIC
+        )
     return tuple(int(value) for value in values)
 
 

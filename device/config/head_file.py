@@ -164,14 +164,14 @@ class SinkSpec(Table):
     def _check_outputs(self) -> "SinkSpec":
         """Raise ValueError if an output or place is used twice or is not there, or a colour draws too much current."""
         leds = self.colours.values()
-        outputs = [output for one in leds for several in one.outputs for output in several]
+        outputs = [output for led in leds for several in led.outputs for output in several]
         if len(set(outputs)) < len(outputs) or not all(0 <= output < OUTPUTS * self.chips for output in outputs):
             raise ValueError(f"outputs are different numbers from 0 to {OUTPUTS * self.chips - 1}")
-        places = [place for one in leds for place in one.places]
+        places = [place for led in leds for place in led.places]
         if len(set(places)) < len(places) or not all(0 <= place < self.rows * self.cols for place in places):
             raise ValueError(f"places are different numbers from 0 to {self.rows * self.cols - 1}")
-        for colour, one in self.colours.items():
-            if (drawn_ma := self.output_ma * sum(map(len, one.outputs))) > self.most_ma:
+        for colour, driven in self.colours.items():
+            if (drawn_ma := self.output_ma * sum(map(len, driven.outputs))) > self.most_ma:
                 raise ValueError(f"{colour} draws {drawn_ma:g} mA, more than most_ma = {self.most_ma:g}")
         return self
 

@@ -126,7 +126,7 @@ class PiCamera(RetryingCamera):
 
     def _camera_index(self) -> int:
         """Return the index of the first camera with the sensor of the head file; CameraMissing or CameraMismatch."""
-        found = [str(one["Model"]) for one in self._library.global_camera_info()]
+        found = [str(camera["Model"]) for camera in self._library.global_camera_info()]
         if not found:
             raise CameraMissing(f"libcamera finds no camera; this head needs the {self._spec.sensor}", NO_CAMERA_REMEDY)
         for number, model in enumerate(found):

@@ -98,17 +98,17 @@ class _LitCamera:
         return first if first.ok else self._measured(light, colour)
 
     def _measured(self, light: GuardedLight, colour: Colour) -> ProbeFinding:
-        glow = light.hazard.brightest(colour)
+        illumination = light.hazard.brightest(colour)
         shot = ExposureSettings(self.exposure_s)
         dark = self.camera.expose(shot).counts.astype(np.float64)
         begin_s = self.clock.now_s()
-        with light.on(glow):
+        with light.on(illumination):
             lit = float(self.camera.expose(shot).counts.mean(dtype=np.float64))
         self.clock.sleep(self.clock.now_s() - begin_s)  # as much darkness: no light is left to repay
         error = float(dark.std() / np.sqrt(dark.size))
         more = lit - float(dark.mean())
         if more > max(DETECTION_SIGMAS * error, 0.05):
-            return ProbeFinding("ring", True, f"{more:.1f} counts above the dark, in {glow.colour}")
+            return ProbeFinding("ring", True, f"{more:.1f} counts above the dark, in {illumination.colour}")
         return ProbeFinding("ring", False, "lit, and not seen", "It may be dead, or covered. Call the technician.")
 
 

@@ -25,13 +25,13 @@ GLOBAL = 0xFF  # 0b111 and 31: smaller values add a second, slow PWM that beats 
 BLUE_GREEN_RED: tuple[Colour, Colour, Colour] = ("blue", "green", "red")  # byte order on the bus
 
 
-def lit_frame(chain: ChainSpec, leds: Sequence[int], glow: Illumination) -> bytes:
+def lit_frame(chain: ChainSpec, leds: Sequence[int], illumination: Illumination) -> bytes:
     """Return the SPI frame that lights only these LEDs (chain indices), at level times trim, at least 1/255."""
     frame = bytearray(dark_frame(chain.rows * chain.cols))
-    channel = 1 + BLUE_GREEN_RED.index(glow.colour)
+    channel = 1 + BLUE_GREEN_RED.index(illumination.colour)
     for place, led in enumerate(leds):
         trim = chain.trims[place] if chain.trims else 1.0
-        frame[4 + 4 * led + channel] = max(1, round(FULL * glow.level * trim))
+        frame[4 + 4 * led + channel] = max(1, round(FULL * illumination.level * trim))
     return bytes(frame)
 
 
@@ -43,19 +43,19 @@ LIT_CONTROL = (
 )
 
 
-def lit_packets(sinks: SinkSpec, glow: Illumination) -> bytes:
+def lit_packets(sinks: SinkSpec, illumination: Illumination) -> bytes:
     """Return the message that lights the LEDs of one colour, at level times trim, at least 1/65535.
 
     LightFault for a colour that the ring does not have. The packet of the last chip comes first; chip 0 is that at the
     computer, and its outputs 0 to 11 are R0, G0, B0, R1 ... B3.
     """
-    if glow.colour not in sinks.colours:
-        raise LightFault(f"this ring has no {glow.colour} LEDs", "Correct light.colour in the head file.")
-    leds = sinks.colours[glow.colour]
+    if illumination.colour not in sinks.colours:
+        raise LightFault(f"this ring has no {illumination.colour} LEDs", "Correct light.colour in the head file.")
+    leds = sinks.colours[illumination.colour]
     greys = [0] * (OUTPUTS * sinks.chips)
     for outputs, trim in zip(leds.outputs, leds.trims or (1.0,) * len(leds.outputs), strict=True):
         for output in outputs:
-            greys[output] = max(1, round(GREY_MAX * glow.level * trim))
+            greys[output] = max(1, round(GREY_MAX * illumination.level * trim))
     head = (COMMAND << 5 | LIT_CONTROL) << 21 | FULL_BRIGHTNESS << 14 | FULL_BRIGHTNESS << 7 | FULL_BRIGHTNESS
     return b"".join(
         head.to_bytes(4, "big") + b"".join(grey.to_bytes(2, "big") for grey in reversed(greys[first : first + OUTPUTS]))
@@ -81,30 +81,30 @@ class LedRing:
 
     def __init__(self, device: str, dark: bytes, guardian: Guardian, lease_s: float, pulse: Pulse | None) -> None:
         self._dark, self._guardian, self._lease_s, self._pulse = dark, guardian, lease_s, pulse
-        self._glow: Illumination | None = None
+        self._illumination: Illumination | None = None
         self._lock = Lock()  # the guard's timer may turn the ring off while another thread turns it on
         self._bus: SpiBus | None = SpiBus(device)
         self.off()
 
-    def _lit(self, glow: Illumination) -> bytes:
+    def _lit(self, illumination: Illumination) -> bytes:
         """Return the message that lights the ring; LightFault for a colour that it does not have."""
         raise NotImplementedError
 
     @property
     def illumination(self) -> Illumination | None:
         """Return the current illumination; None when it is off."""
-        return self._glow
+        return self._illumination
 
-    def on(self, glow: Illumination) -> "RingLightContext":
+    def on(self, illumination: Illumination) -> "RingLightContext":
         """Return a context in which the ring is on; LightFault on entry if that fails, and the ring is then off."""
-        return RingLightContext(self, glow)
+        return RingLightContext(self, illumination)
 
     def off(self) -> None:
         """Turn the ring off, stop the heartbeat, cancel the lease; harmless if off or closed. Raises LightFault."""
         with self._lock:
             if self._bus is None:
                 return
-            self._glow = None
+            self._illumination = None
             try:
                 self._bus.send(self._dark)
                 self._bus.send(self._dark)
@@ -113,17 +113,17 @@ class LedRing:
                     self._pulse.stop()
             self._guardian.end_lease()
 
-    def turn_on(self, glow: Illumination) -> None:
+    def turn_on(self, illumination: Illumination) -> None:
         """Grant the lease, start the heartbeat, then turn the ring on; LightFault. Called by RingLightContext only."""
         with self._lock:
             if self._bus is None:
                 raise LightFault("the lamp has been closed")
-            frame = self._lit(glow)
+            frame = self._lit(illumination)
             self._guardian.grant_lease(self._lease_s)
             if self._pulse is not None:
                 self._pulse.start(self._lease_s)
                 self._bus.send(self._dark)  # LEDs show arbitrary colours after power-up
-            self._glow = glow
+            self._illumination = illumination
             self._bus.send(frame)
 
     def close(self) -> None:
@@ -146,10 +146,10 @@ class Apa102Ring(LedRing):
         self._leds = ring(chain)
         super().__init__(chain.device, dark_frame(chain.rows * chain.cols), guardian, lease_s, pulse)
 
-    def _lit(self, glow: Illumination) -> bytes:
-        if glow.colour not in BLUE_GREEN_RED:
-            raise LightFault(f"an APA102 has no {glow.colour} LED", "Correct light.colour in the head file.")
-        return lit_frame(self._chain, self._leds, glow)
+    def _lit(self, illumination: Illumination) -> bytes:
+        if illumination.colour not in BLUE_GREEN_RED:
+            raise LightFault(f"an APA102 has no {illumination.colour} LED", "Correct light.colour in the head file.")
+        return lit_frame(self._chain, self._leds, illumination)
 
 
 class Tlc5971Ring(LedRing):
@@ -159,20 +159,20 @@ class Tlc5971Ring(LedRing):
         self._sinks = sinks
         super().__init__(sinks.device, dark_packets(sinks.chips), guardian, lease_s, pulse)
 
-    def _lit(self, glow: Illumination) -> bytes:
-        return lit_packets(self._sinks, glow)
+    def _lit(self, illumination: Illumination) -> bytes:
+        return lit_packets(self._sinks, illumination)
 
 
 class RingLightContext:
     """Context manager: the ring is on from entry to exit."""
 
-    def __init__(self, ring: LedRing, glow: Illumination) -> None:
-        self._ring, self._glow = ring, glow
+    def __init__(self, ring: LedRing, illumination: Illumination) -> None:
+        self._ring, self._illumination = ring, illumination
 
     def __enter__(self) -> "RingLightContext":
         """Turn the ring on; after an error turn it off again and raise the error."""
         try:
-            self._ring.turn_on(self._glow)
+            self._ring.turn_on(self._illumination)
         except BaseException:
             self._ring.off()
             raise

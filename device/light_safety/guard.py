@@ -19,7 +19,7 @@ from device.light_safety.hazard import Hazard
 from device.ports import Light, LightContext
 from device.values import EYES, Eye, Illumination
 
-AFTERGLOW_S = 2.0  # after a kill the guardian darkens the lamp in 0.1 s, the hardware gate within this time
+LIT_AFTER_KILL_S = 2.0  # after a kill the guardian darkens the lamp in 0.1 s, the hardware gate within this time
 
 
 class GuardedLight:
@@ -30,8 +30,11 @@ class GuardedLight:
     """
 
     def __init__(self, light: Light, clock: Clock, max_on_s: float, hazard: Hazard, ledger: Ledger) -> None:
-        self._light, self._clock, self.max_on_s = light, clock, max_on_s
-        self.hazard, self.ledger = hazard, ledger
+        self._light = light
+        self._clock = clock
+        self.max_on_s = max_on_s
+        self.hazard = hazard
+        self.ledger = ledger
         self.given_j_per_cm2 = 0.0  # dose of the last stretch of light
         self.total_j_per_cm2 = 0.0  # dose of all stretches of light that are over
         self._timer: Timer | None = None
@@ -65,16 +68,16 @@ class GuardedLight:
         """Return the dose of the running stretch of light until now; 0.0 while the lamp is dark."""
         if self._held is None:
             return 0.0
-        return self.hazard.dose_j_per_cm2(self._glow, self._clock.now_s() - self._lit_at_s)
+        return self.hazard.dose_j_per_cm2(self._illumination, self._clock.now_s() - self._lit_at_s)
 
-    def on(self, glow: Illumination, eyes: Sequence[Eye] = EYES, *, in_visit: bool = False) -> LightContext:
+    def on(self, illumination: Illumination, eyes: Sequence[Eye] = EYES, *, in_visit: bool = False) -> LightContext:
         """Return a context with the lamp on from entry to exit; its dose counts for `eyes`.
 
         By default for both: it may be unknown which eye is in front of the head. Light that belongs to no visit
         (`in_visit` False) has a lower limit of dose. Errors on entry, with the lamp off: LightLimit (already on,
         darkness due, or a limit of irradiance or dose), StoreError of the ledger, LightFault.
         """
-        return _Holding(self, glow, eyes, in_visit)
+        return _Holding(self, illumination, eyes, in_visit)
 
     def dose_report(self) -> DoseReport:
         """Return the light figures of a report, J/cm2: last dose, dose by eye in 24 h, limit, eyes above warning."""
@@ -88,19 +91,23 @@ class GuardedLight:
             limits_unchecked=limits.unchecked,
         )
 
-    def turn_on(self, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
+    def turn_on(self, illumination: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
         """Turn the lamp on and start its timer; LightLimit if it is on, darkness is due or a limit is exceeded."""
         now_s = self._clock.now_s()
         if self._held is not None:
             raise LightLimit("the lamp is already lit by someone else")
-        self._debt_s, self._dark_at_s = max(0.0, self._debt_s - (now_s - self._dark_at_s)), now_s  # counts once
+        self._debt_s = max(0.0, self._debt_s - (now_s - self._dark_at_s))
+        self._dark_at_s = now_s  # counts once
         if self._debt_s >= self.max_on_s:
             wait_s = max(1, ceil(self._debt_s - self.max_on_s))
             message = f"{self._debt_s:.1f} s of light have not yet been followed by darkness"
             raise LightLimit(message, f"Wait {wait_s} s, then press again.", wait_s=wait_s)
-        self._reserve(glow, eyes, in_visit)
-        self._glow, self._lit_at_s, self._cut_at_s, self._late = glow, self._clock.now_s(), None, False
-        self._held = self._light.on(glow)
+        self._reserve(illumination, eyes, in_visit)
+        self._illumination = illumination
+        self._lit_at_s = self._clock.now_s()
+        self._cut_at_s = None
+        self._late = False
+        self._held = self._light.on(illumination)
         self._timer = Timer(self.max_on_s, self.cut)
         self._timer.daemon = True
         self._timer.start()
@@ -108,13 +115,13 @@ class GuardedLight:
         if self._late:  # the timer fired before the lamp was on: nothing else would end the light
             raise LightCut(f"the lamp took longer to light up than the {self.max_on_s:g} s it may shine")
 
-    def _reserve(self, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
+    def _reserve(self, illumination: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
         """Reserve the largest dose of this stretch, before the lamp is on; LightLimit if it is not permitted.
 
         LightWithoutVisit if the dose would be permitted in a visit.
         """
-        self.hazard.refuse(glow)
-        most_j_per_cm2 = self.hazard.dose_j_per_cm2(glow, self.max_on_s + AFTERGLOW_S)
+        self.hazard.refuse(illumination)
+        most_j_per_cm2 = self.hazard.dose_j_per_cm2(illumination, self.max_on_s + LIT_AFTER_KILL_S)
         limits = self.hazard.limits
         stop_j_per_cm2 = limits.stop_j_per_cm2 if in_visit else limits.stop_without_visit_j_per_cm2
         try:
@@ -136,7 +143,8 @@ class GuardedLight:
         self._light.off()
         if self._timer is not None:
             self._timer.cancel()
-        reserved, self._reserved = self._reserved, None
+        reserved = self._reserved
+        self._reserved = None
         if reserved is None:
             return
         given_s = 0.0
@@ -145,7 +153,7 @@ class GuardedLight:
             self._dark_at_s = self._clock.now_s() if self._cut_at_s is None else self._cut_at_s
             given_s = self._dark_at_s - self._lit_at_s
             self._debt_s += given_s
-        self.given_j_per_cm2 = self.hazard.dose_j_per_cm2(self._glow, given_s)
+        self.given_j_per_cm2 = self.hazard.dose_j_per_cm2(self._illumination, given_s)
         self.total_j_per_cm2 += self.given_j_per_cm2
         with suppress(StoreError):  # the whole reservation stays counted, and the next light is refused
             self.ledger.settle(reserved, self.given_j_per_cm2)
@@ -154,12 +162,15 @@ class GuardedLight:
 class _Holding:
     """Context of one stretch: the lamp is on from entry to exit, and off after an error on entry."""
 
-    def __init__(self, light: GuardedLight, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
-        self._light, self._glow, self._eyes, self._in_visit = light, glow, eyes, in_visit
+    def __init__(self, light: GuardedLight, illumination: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
+        self._light = light
+        self._illumination = illumination
+        self._eyes = eyes
+        self._in_visit = in_visit
 
     def __enter__(self) -> "_Holding":
         try:
-            self._light.turn_on(self._glow, self._eyes, self._in_visit)
+            self._light.turn_on(self._illumination, self._eyes, self._in_visit)
         except BaseException:
             self._light.off()
             raise

@@ -249,42 +249,44 @@ class Hazard:
     beams: Radiometry
     limits: Limits
 
-    def photochemical_w_per_cm2(self, glow: Illumination) -> float:
+    def photochemical_w_per_cm2(self, illumination: Illumination) -> float:
         """Return the A-weighted irradiance of the retina, W/cm2."""
-        beam = self._beam(glow)
+        beam = self._beam(illumination)
         weight = self.limits.photochemical_weight.of_spectrum(beam.wavelength_um, beam.fwhm_um)
-        return glow.level * beam.retina_w_per_cm2 * weight
+        return illumination.level * beam.retina_w_per_cm2 * weight
 
-    def thermal_w_per_cm2(self, glow: Illumination) -> float:
+    def thermal_w_per_cm2(self, illumination: Illumination) -> float:
         """Return the R-weighted irradiance of the retina, W/cm2."""
-        beam = self._beam(glow)
+        beam = self._beam(illumination)
         weight = self.limits.thermal_weight.of_spectrum(beam.wavelength_um, beam.fwhm_um)
-        return glow.level * beam.retina_w_per_cm2 * weight
+        return illumination.level * beam.retina_w_per_cm2 * weight
 
-    def waist_w_per_cm2(self, glow: Illumination) -> float:
+    def waist_w_per_cm2(self, illumination: Illumination) -> float:
         """Return the irradiance in the waist of the beam, unweighted, W/cm2."""
-        return glow.level * self._beam(glow).waist_w_per_cm2
+        return illumination.level * self._beam(illumination).waist_w_per_cm2
 
-    def dose_j_per_cm2(self, glow: Illumination, duration_s: float) -> float:
+    def dose_j_per_cm2(self, illumination: Illumination, duration_s: float) -> float:
         """Return the A-weighted retinal dose of an illumination of this duration, J/cm2."""
-        return self.photochemical_w_per_cm2(glow) * max(0.0, duration_s)
+        return self.photochemical_w_per_cm2(illumination) * max(0.0, duration_s)
 
-    def _beam(self, glow: Illumination) -> Beam:
+    def _beam(self, illumination: Illumination) -> Beam:
         """Return the beam of a colour; LightLimit for a colour whose irradiance is not known: this head has no LED."""
-        if glow.colour not in self.beams:
+        if illumination.colour not in self.beams:
             raise LightLimit(
-                f"this head has no {glow.colour} LEDs, so their irradiance is not known",
+                f"this head has no {illumination.colour} LEDs, so their irradiance is not known",
                 f"Choose one of {', '.join(self.beams)} in the head file.",
             )
-        return self.beams[glow.colour]
+        return self.beams[illumination.colour]
 
-    def refuse(self, glow: Illumination) -> None:
+    def refuse(self, illumination: Illumination) -> None:
         """Raise LightLimit, with the permitted level, if an illumination exceeds any of the three irradiance limits."""
-        times = self._times(glow)
+        times = self._times(illumination)
         if times > 1:
+            percent = 100 * illumination.level
+            highest = 100 * self.highest_level(illumination.colour)
             raise LightLimit(
-                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
-                f"Dim it to {100 * self.highest_level(glow.colour):g} % or less, or have the head's light measured.",
+                f"{illumination.colour} light at {percent:.3g} % is {times:.3g} times brighter than an eye may see",
+                f"Dim it to {highest:g} % or less, or have the head's light measured.",
             )
 
     def highest_level(self, colour: Colour) -> float:
@@ -297,11 +299,11 @@ class Hazard:
             self.refuse(Illumination(colour, 1 / LEVELS))
         return Illumination(colour, level)
 
-    def _times(self, glow: Illumination) -> float:
+    def _times(self, illumination: Illumination) -> float:
         """Return the largest irradiance over its limit."""
         limits = self.limits
         return max(
-            self.photochemical_w_per_cm2(glow) / limits.photochemical_w_per_cm2,
-            self.thermal_w_per_cm2(glow) / limits.thermal_w_per_cm2,
-            self.waist_w_per_cm2(glow) / limits.waist_w_per_cm2,
+            self.photochemical_w_per_cm2(illumination) / limits.photochemical_w_per_cm2,
+            self.thermal_w_per_cm2(illumination) / limits.thermal_w_per_cm2,
+            self.waist_w_per_cm2(illumination) / limits.waist_w_per_cm2,
         )

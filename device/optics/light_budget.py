@@ -96,7 +96,7 @@ def possible_gains(factors: Sequence[Factor]) -> dict[Cause, float]:
     for factor in factors:
         if factor.ideal is not None:
             found[factor.cause] = found.get(factor.cause, 1.0) * factor.ideal / factor.value
-    return dict(sorted(found.items(), key=lambda one: -one[1]))
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
 def retina_mw_per_cm2(factors: Sequence[Factor]) -> float:

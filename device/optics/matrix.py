@@ -116,8 +116,8 @@ def lamps_of(spec: InstrumentSpec) -> Mapping[Colour, Lamp] | None:
     sinks = spec.light.sinks
     if sinks is not None:
         return {
-            colour: Lamp(led_at(one.wavelength_um, one.power_mw), len(one.places), one.emitter_mm)
-            for colour, one in sinks.colours.items()
+            colour: Lamp(led_at(outputs.wavelength_um, outputs.power_mw), len(outputs.places), outputs.emitter_mm)
+            for colour, outputs in sinks.colours.items()
         }
     chain = chain_of(spec)
     return None if chain is None else {colour: Lamp(led, len(ring(chain))) for colour, led in LED.items()}

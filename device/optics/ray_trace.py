@@ -134,16 +134,18 @@ def _refract(surface: Surface, beam: Rays, normals: Points, index_before: float)
 
 def reversed_surfaces(surfaces: Sequence[Surface], index_before: float = 1.0) -> tuple[Surface, ...]:
     """Return the same surfaces as light from behind meets them: mirrored at z = 0, in the opposite order."""
-    before = [index_before, *(one.index_behind for one in surfaces[:-1])]
+    before = [index_before, *(surface.index_behind for surface in surfaces[:-1])]
     return tuple(
-        replace(one, at_mm=-one.at_mm, radius_mm=-one.radius_mm, index_behind=index, tilt_deg=-one.tilt_deg)
-        for one, index in zip(reversed(surfaces), reversed(before), strict=True)
+        replace(
+            surface, at_mm=-surface.at_mm, radius_mm=-surface.radius_mm, index_behind=index, tilt_deg=-surface.tilt_deg
+        )
+        for surface, index in zip(reversed(surfaces), reversed(before), strict=True)
     )
 
 
 def moved(surfaces: Sequence[Surface], by_mm: float) -> tuple[Surface, ...]:
     """Return the surfaces moved along the axis."""
-    return tuple(replace(one, at_mm=one.at_mm + by_mm) for one in surfaces)
+    return tuple(replace(surface, at_mm=surface.at_mm + by_mm) for surface in surfaces)
 
 
 class Paraxial(NamedTuple):
@@ -161,12 +163,12 @@ def paraxial(surfaces: Sequence[Surface], index_before: float = 1.0) -> Paraxial
     """
     matrix = np.eye(2)
     at_mm = surfaces[0].at_mm
-    for one in surfaces:
-        matrix = np.array([[1, one.at_mm - at_mm], [0, 1]]) @ matrix
-        ratio = index_before / one.index_behind
-        matrix = np.array([[1, 0], [(ratio - 1) / one.radius_mm, ratio]]) @ matrix
-        index_before = one.index_behind
-        at_mm = one.at_mm
+    for surface in surfaces:
+        matrix = np.array([[1, surface.at_mm - at_mm], [0, 1]]) @ matrix
+        ratio = index_before / surface.index_behind
+        matrix = np.array([[1, 0], [(ratio - 1) / surface.radius_mm, ratio]]) @ matrix
+        index_before = surface.index_behind
+        at_mm = surface.at_mm
     (a, _), (c, d) = matrix
     if abs(c) < 1e-12:
         raise SpecError("these surfaces have no focus", "Give a lens with a power other than zero.")

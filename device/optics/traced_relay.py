@@ -153,18 +153,19 @@ def traced_relay(
     first, second = (
         _scaled(pair, scale) for pair, scale in zip(pairs, (deviation.first_scale, deviation.second_scale), strict=True)
     )
-    one = paraxial(pairs[0])  # the tube is made for the nominal lenses
-    two = paraxial(pairs[1])
-    first = moved(first, one.front_mm)
-    apart = pairs[0][-1].at_mm + one.front_mm + one.back_mm + two.front_mm + deviation.separation_mm
+    first_lens = paraxial(pairs[0])  # the tube is made for the nominal lenses
+    second_lens = paraxial(pairs[1])
+    first = moved(first, first_lens.front_mm)
+    behind_first_mm = pairs[0][-1].at_mm + first_lens.front_mm + first_lens.back_mm
+    apart = behind_first_mm + second_lens.front_mm + deviation.separation_mm
     second = moved(second, apart)
-    lamp_at_mm = apart + pairs[1][-1].at_mm + two.back_mm
+    lamp_at_mm = apart + pairs[1][-1].at_mm + second_lens.back_mm
     plate = _plate(path, path.layout, wavelength, lamp_at_mm - path.relay.splitter_to_iris_mm)
     found = TracedRelay(
         (*first, *second, *plate),
         (*first, *second),
-        one,
-        two,
+        first_lens,
+        second_lens,
         lamp_at_mm,
         lamp_at_mm,
         path.eye.pupil_mm,
@@ -201,7 +202,7 @@ def _pairs(
 
 def _scaled(surfaces: Sequence[Surface], scale: float) -> tuple[Surface, ...]:
     """Return surfaces with all radii scaled, which scales the focal length of thin lenses by the same factor."""
-    return tuple(replace(one, radius_mm=one.radius_mm * scale) for one in surfaces)
+    return tuple(replace(surface, radius_mm=surface.radius_mm * scale) for surface in surfaces)
 
 
 def _plate(path: LightPath, layout: LayoutSpec, wavelength_um: float, middle_mm: float) -> tuple[Surface, ...]:
@@ -217,7 +218,7 @@ def _plate(path: LightPath, layout: LayoutSpec, wavelength_um: float, middle_mm:
 
 def without_rims(surfaces: Sequence[Surface]) -> tuple[Surface, ...]:
     """Return the surfaces without clear apertures."""
-    return tuple(replace(one, clear_mm=inf) for one in surfaces)
+    return tuple(replace(surface, clear_mm=inf) for surface in surfaces)
 
 
 def _disc(count: int, radius_mm: float) -> np.ndarray:

@@ -64,10 +64,10 @@ def correction_behind(lens: TrialLens, vertex_mm: float, eye: PowerVector = EMME
     A lens of +5 dpt at 12 mm makes an emmetropic eye myopic: -4.72 dpt.
     """
     distance_m = vertex_mm / 1000
-    one = np.eye(2)
+    identity = np.eye(2)
     leaving = -eye.matrix
-    behind_lens = leaving @ np.linalg.inv(one - distance_m * leaving) + lens.power.matrix
-    seen = -behind_lens @ np.linalg.inv(one + distance_m * behind_lens)
+    behind_lens = leaving @ np.linalg.inv(identity - distance_m * leaving) + lens.power.matrix
+    seen = -behind_lens @ np.linalg.inv(identity + distance_m * behind_lens)
     return PowerVector(
         float(seen[0, 0] + seen[1, 1]) / 2, float(seen[0, 0] - seen[1, 1]) / 2, float(seen[0, 1] + seen[1, 0]) / 2
     )

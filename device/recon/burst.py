@@ -125,7 +125,7 @@ class BurstJoiner:
         used.
         """
         reasons = dict(unusable or {})
-        seen = {k: one for k, one in (ready or {}).items() if k not in reasons}
+        seen = {k: seen_frame for k, seen_frame in (ready or {}).items() if k not in reasons}
         for k, frame in enumerate(frames):
             if k in reasons or k in seen:
                 continue
@@ -138,10 +138,10 @@ class BurstJoiner:
         if not seen:
             raise FrameError(f"no frame of the burst can be used; the first: {reasons[0]}", "Take the burst again.")
         grid = self._stage.grid
-        field = self._field([one.picture for one in seen.values()])
+        field = self._field([seen_frame.picture for seen_frame in seen.values()])
         registrar = Registrar(field[grid.shown], grid.n)
-        flats = {k: registrar.flat(one.picture[grid.shown]) for k, one in seen.items()}
-        shifts, left_out = register_group(registrar, flats, {k: one.mean_dn for k, one in seen.items()})
+        flats = {k: registrar.flat(seen_frame.picture[grid.shown]) for k, seen_frame in seen.items()}
+        shifts, left_out = register_group(registrar, flats, {k: seen_frame.mean_dn for k, seen_frame in seen.items()})
         reasons |= left_out
         uses = [FrameUse(k, k not in reasons, shifts.get(k), 0.0, reasons.get(k)) for k in range(len(frames))]
         yield self._join(seen, field, uses)
@@ -179,7 +179,7 @@ class BurstJoiner:
         return blurred, along / energy if energy > 0 else 0.0
 
     def _join(self, seen: dict[int, SeenFrame], field: Image, uses: Sequence[FrameUse]) -> JoinedFrame:
-        used = [one.index for one in uses if one.used]
+        used = [use.index for use in uses if use.used]
         total_dn = sum(seen[k].mean_dn for k in used)
         shares = {k: seen[k].mean_dn / total_dn for k in used}
         reference = seen[used[0]]
@@ -190,12 +190,12 @@ class BurstJoiner:
         weights = np.zeros(self._shape, np.float32)
         for k in used:
             shift = uses[k].shift_px
-            one = seen[k]
+            frame = seen[k]
             assert shift is not None
-            smooth, scale = (base, base_scale) if one is reference else self._smooth(one, field, near)
-            kernels.subtract_scaled(one.light, smooth, scale, one.good, detail)
-            add_moved_back(detail, one.good, shift, shares[k], reference.mean_dn / one.mean_dn, joined, weights)
+            smooth, scale = (base, base_scale) if frame is reference else self._smooth(frame, field, near)
+            kernels.subtract_scaled(frame.light, smooth, scale, frame.good, detail)
+            add_moved_back(detail, frame.good, shift, shares[k], reference.mean_dn / frame.mean_dn, joined, weights)
         kernels.finish_mean(joined, weights, MIN_WEIGHT, base, base_scale)
         light = total_dn / reference.mean_dn
-        frames = tuple(replace(one, weight=shares.get(one.index, 0.0)) for one in uses)
+        frames = tuple(replace(use, weight=shares.get(use.index, 0.0)) for use in uses)
         return JoinedFrame(joined, light, frames)

@@ -156,7 +156,7 @@ class BurstReconstructor:
         """
         run = _Run(self, deadline, refract)
         ready = dict(prepared or {})
-        tasks = {k: one.refraction for k, one in ready.items()}
+        tasks = {k: prepared_frame.refraction for k, prepared_frame in ready.items()}
         if len(frames) == 1:
             yield from self.single.steps(
                 frames[0], dark, simulated=simulated, deadline=deadline, refract=refract, refraction=tasks.get(0)
@@ -170,10 +170,10 @@ class BurstReconstructor:
             uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, reasons.get(k)) for k in range(len(frames))]
             yield from run.solve_one(frames[0], dark, uses, 0, simulated, tasks.get(0))
             return
-        yield from run.join(frames, dark, unusable, {k: one.seen for k, one in ready.items()})
+        yield from run.join(frames, dark, unusable, {k: prepared_frame.seen for k, prepared_frame in ready.items()})
         assert run.joined is not None
         uses = run.joined.frames
-        used = [one.index for one in uses if one.used]
+        used = [use.index for use in uses if use.used]
         if len(used) == 1:
             yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated, tasks.get(used[0]))
         else:
@@ -265,7 +265,7 @@ class _Run:
                 made = replace(step, report=replace(step.report, quality=quality))
                 yield self._reported(in_one_exposure(made, joined.light), joined.frames)
             elif isinstance(step, Reconstruction):  # no time for the last stage: this is the picture of one frame
-                yield self._reported(step, only(next(one.index for one in joined.frames if one.used), joined.frames))
+                yield self._reported(step, only(next(use.index for use in joined.frames if use.used), joined.frames))
             elif step.last:  # the quick look was that of the first frame
                 is_solved = True
                 yield replace(step, picture=step.picture / np.float32(joined.light))
@@ -323,8 +323,8 @@ def only(index: int, uses: Sequence[FrameUse]) -> tuple[FrameUse, ...]:
     `uses` are those known so far; each other frame keeps its reason, or has NO_TIME without one.
     """
     return tuple(
-        FrameUse(one.index, True, (0.0, 0.0), 1.0)
-        if one.index == index
-        else replace(one, used=False, weight=0.0, reason=one.reason or NO_TIME)
-        for one in uses
+        FrameUse(use.index, True, (0.0, 0.0), 1.0)
+        if use.index == index
+        else replace(use, used=False, weight=0.0, reason=use.reason or NO_TIME)
+        for use in uses
     )

@@ -127,8 +127,10 @@ def predicted_blue(red: Image, green: Image, field: Image) -> Image:
     `white_balance.balanced` sets another mean in the picture of a press.
     """
     inside = field > 0.5
-    means = [float(one[inside].mean()) if inside.any() else float(one.mean()) for one in (red, green)]
-    r, g = (np.clip(one / max(mean, 1e-30), 0, MAX_OF_MEAN) for one, mean in zip((red, green), means, strict=True))
+    means = [float(channel[inside].mean()) if inside.any() else float(channel.mean()) for channel in (red, green)]
+    r, g = (
+        np.clip(channel / max(mean, 1e-30), 0, MAX_OF_MEAN) for channel, mean in zip((red, green), means, strict=True)
+    )
     offset, of_red, of_green = BLUE_FROM_RED_GREEN
     blue = offset + of_red * r + of_green * g
     return np.asarray(np.maximum(blue, 0) * BLUE_OVER_GREEN * means[1] * field, np.float32)

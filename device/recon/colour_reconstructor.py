@@ -83,12 +83,13 @@ class ColourReconstructor:
         self.clock = green.clock
         self.join_cost = DurationEstimate()
         self.singles = {
-            colour: one.single if isinstance(one, BurstReconstructor) else one for colour, one in others.items()
+            colour: solver.single if isinstance(solver, BurstReconstructor) else solver
+            for colour, solver in others.items()
         }
         self._otfs = {
-            colour: InterpolatedOtf(one.calibration.psfs[one.psf_index])
-            for colour, one in self.singles.items()
-            if one is not green
+            colour: InterpolatedOtf(solver.calibration.psfs[solver.psf_index])
+            for colour, solver in self.singles.items()
+            if solver is not green
         }
         self.box = field_box(calibration, shape)
         radius_px = field_radius_px(calibration)
@@ -196,7 +197,7 @@ class ColourReconstructor:
             field = lit_field(reference, Grid.periodic((reference.shape[0], reference.shape[1]), 1, inf))
         joined = join_colours(cropped, field, n)
         ratios = white_ratios(self._calibration, lights_dn_per_s)
-        channels = tuple(replace(one, white_ratio=ratios.get(one.name)) for one in joined.channels)
+        channels = tuple(replace(channel, white_ratio=ratios.get(channel.name)) for channel in joined.channels)
         picture = balanced(joined.picture, field, ratios)
         self.join_cost.add(self.clock.now_s() - begin_s)
         return replace(joined, picture=picture, channels=channels)
@@ -258,14 +259,14 @@ class _Run:
         FrameError for useless frames.
         """
         owner = self._owner
-        one = owner.others[colour]
+        solver = owner.others[colour]
         begin_s = owner.clock.now_s()
         owner.refocus(colour, eye)
         deadline = None if self._deadline is None else self._deadline.later(-owner.join_cost.seconds)
-        if isinstance(one, BurstReconstructor):
-            steps = one.steps(frames, dark, simulated=True, deadline=deadline, refract=False)
+        if isinstance(solver, BurstReconstructor):
+            steps = solver.steps(frames, dark, simulated=True, deadline=deadline, refract=False)
         else:
-            steps = one.steps(frames[0], dark, simulated=True, deadline=deadline, refract=False)
+            steps = solver.steps(frames[0], dark, simulated=True, deadline=deadline, refract=False)
         for step in steps:
             if isinstance(step, RoundDone):
                 paused_s = owner.clock.now_s()

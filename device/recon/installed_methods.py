@@ -14,7 +14,7 @@ import numpy as np
 from device import plugins
 from device.plugins import Plugin
 from device.recon.method_settings import ConfigurableSolver, Settings
-from device.recon.methods import METHODS, Method, unknown_method
+from device.recon.methods import METHODS, Method, unknown_method_error
 from device.recon.model.fft_plans import Planner
 from device.recon.model.forward_model import Model
 from device.recon.model.preprocessing import Linear
@@ -45,7 +45,7 @@ def find_method(name: str) -> Method:
         return _checked(plugin, found)
     entries = plugins.installed(plugins.METHODS)
     if name not in entries:
-        raise unknown_method(name, [*METHODS, *entries])
+        raise unknown_method_error(name, [*METHODS, *entries])
     return _installed(entries[name])
 
 

@@ -200,10 +200,10 @@ DEFAULT = "variation"
 def method_named(name: str, methods: Mapping[str, Method] = METHODS) -> Method:
     """Return the method with that name from a table; SettingError lists the names of the table."""
     if name not in methods:
-        raise unknown_method(name, methods)
+        raise unknown_method_error(name, methods)
     return methods[name]
 
 
-def unknown_method(name: str, known: Iterable[str]) -> SettingError:
+def unknown_method_error(name: str, known: Iterable[str]) -> SettingError:
     """Return the error for a method that does not exist; its remedy lists the `known` names."""
     return SettingError(f"there is no method '{name}'", f"Choose one of: {', '.join(known)}.")

@@ -121,17 +121,17 @@ def make_montage(
     """
     _refuse_different(pictures)
     _refuse_too_wide(pictures[0], px_per_deg)
-    fields = [_field(one) for one in pictures]
+    fields = [_field(given) for given in pictures]
     n = max(1, round(_diameter_px(fields) / FIELD_SAMPLES))
     box = _middle_box(fields)
     flats = [
-        flatten(block_mean(_grey(one)[box], n), block_mean(field[box], n))
-        for one, field in zip(pictures, fields, strict=True)
+        flatten(block_mean(_grey(given)[box], n), block_mean(field[box], n))
+        for given, field in zip(pictures, fields, strict=True)
     ]
     placed = place(flats, n, progress, px_per_deg)
-    used = [one for one in placed if one.used]
+    used = [placement for placement in placed if placement.used]
     picture, origin_px = _blended(
-        {one.index: pictures[one.index] for one in used}, fields, used, projection_of(px_per_deg)
+        {placement.index: pictures[placement.index] for placement in used}, fields, used, projection_of(px_per_deg)
     )
     return Montage(picture, origin_px, tuple(placed), px_per_deg)
 
@@ -198,20 +198,20 @@ def _rank(match: Match) -> tuple[bool, float]:
 def _refuse_different(pictures: Sequence[Image]) -> None:
     if not 0 < len(pictures) <= MAX_PICTURES:
         raise FrameError(f"a montage has 1 to {MAX_PICTURES} pictures, not {len(pictures)}", "Give fewer pictures.")
-    for one in pictures:
-        check_image_shape(one.shape)
-        if min(one.shape[:2]) < MIN_PX:
+    for picture in pictures:
+        check_image_shape(picture.shape)
+        if min(picture.shape[:2]) < MIN_PX:
             raise FrameError(
-                f"a picture of {one.shape[0]} x {one.shape[1]} pixels shows no vessels",
+                f"a picture of {picture.shape[0]} x {picture.shape[1]} pixels shows no vessels",
                 f"Give pictures of at least {MIN_PX} x {MIN_PX} pixels.",
             )
-    shapes = {one.shape for one in pictures}
+    shapes = {picture.shape for picture in pictures}
     if len(shapes) > 1:
         listed = ", ".join(" x ".join(map(str, shape)) for shape in sorted(shapes))
         raise FrameError(f"the pictures have different sizes: {listed}", "Give pictures of one instrument.")
-    if not all(np.isfinite(one).all() for one in pictures):
+    if not all(np.isfinite(picture).all() for picture in pictures):
         raise FrameError("a picture holds values that are not numbers", "Reconstruct it again.")
-    if not all(_grey(one).max() > 0 for one in pictures):
+    if not all(_grey(picture).max() > 0 for picture in pictures):
         raise FrameError("a picture is black", "Leave it out.")
 
 
@@ -246,13 +246,13 @@ def _field(picture: Image) -> Image:
 
 def _diameter_px(fields: Sequence[Image]) -> float:
     """Return the diameter of a disc with the area of the largest field."""
-    return 2 * float(np.sqrt(max(float(one.sum()) for one in fields) / np.pi))
+    return 2 * float(np.sqrt(max(float(mask.sum()) for mask in fields) / np.pi))
 
 
 def _middle_box(fields: Sequence[Image]) -> tuple[slice, slice]:
     """Return the smallest box around the picture's centre that holds every field."""
     rows, cols = fields[0].shape
-    lit = np.any([one > 0.5 for one in fields], axis=0)
+    lit = np.any([mask > 0.5 for mask in fields], axis=0)
     spans = []
     for axis, size in enumerate((rows, cols)):
         places = np.nonzero(lit.any(axis=1 - axis))[0]
@@ -268,17 +268,17 @@ def _blended(
     first = pictures[used[0].index]
     middle = (np.array(first.shape[:2]) - 1) / 2
     border = _border(first.shape[:2]) - middle
-    there = np.concatenate([projection.moved_back(border, one.motion) + middle for one in used])
+    there = np.concatenate([projection.moved_back(border, placement.motion) + middle for placement in used])
     low = np.floor(there.min(axis=0) + ROUNDING_PX).astype(int)
     high = np.ceil(there.max(axis=0) - ROUNDING_PX).astype(int)
     size = int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
     places = np.moveaxis(np.indices(size, dtype=np.float64), 0, -1) + low - middle
     total = np.zeros((*size, *first.shape[2:]), np.float32)
     weights = np.zeros(size, np.float32)
-    for one in used:
-        at = np.moveaxis(projection.moved(places, one.motion) + middle, -1, 0)
-        weight = ndimage.map_coordinates(_feather(fields[one.index]), at, order=1)
-        moved = _resampled(pictures[one.index], at)
+    for placement in used:
+        at = np.moveaxis(projection.moved(places, placement.motion) + middle, -1, 0)
+        weight = ndimage.map_coordinates(_feather(fields[placement.index]), at, order=1)
+        moved = _resampled(pictures[placement.index], at)
         both = (weights > 0.1) & (weight > 0.1)
         gain = 1.0
         if both.any():  # the same retina in another exposure
@@ -311,5 +311,5 @@ def _feather(field: Image) -> Image:
 def _resampled(picture: Image, at: Floats) -> Image:
     """Return the picture at places (2, rows, cols) by cubic interpolation, 0 outside."""
     planes = [picture] if picture.ndim == 2 else [picture[..., c] for c in range(3)]
-    moved = [ndimage.map_coordinates(one, at, order=3) for one in planes]
+    moved = [ndimage.map_coordinates(channel, at, order=3) for channel in planes]
     return np.asarray(moved[0] if len(moved) == 1 else np.stack(moved, axis=2), np.float32)

@@ -159,7 +159,8 @@ class _Stage:
         planner: Planner,
         index: int,
     ) -> None:
-        self.recipe, self.is_closed_form = recipe, method.rounds == 0
+        self.recipe = recipe
+        self.is_closed_form = method.rounds == 0
         self.model = method.model(calibration, shape, recipe.bin, planner, index)
         self.grid = self.model.grid
         self.eye: Wavefront | None = None  # of the PSF in use; None: the stored one
@@ -168,7 +169,9 @@ class _Stage:
         self.joined_preparer = Preprocessor(without_sensor(calibration), self.grid, self.solver.input_buffer)
         self.most = method.rounds if recipe.rounds is None else recipe.rounds
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
-        self.start_cost, self.round_cost, self.finish_cost = DurationEstimate(), DurationEstimate(), DurationEstimate()
+        self.start_cost = DurationEstimate()
+        self.round_cost = DurationEstimate()
+        self.finish_cost = DurationEstimate()
 
     def refocus(self, otf: Spectrum, eye: Wavefront | None) -> None:
         """Use `otf`, the OTF of the PSF of `eye`, from the next `solver.start` on; no-op if in use."""
@@ -257,8 +260,12 @@ class Reconstructor:
         recipes = recipes or default_schedule(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
             raise SettingError("a sample is made of at least one pixel")
-        self.calibration, self.shape, self.clock, self.psf_index = calibration, shape, clock, psf_index
-        self._audience, self._consistency = audience, None if timed else consistency
+        self.calibration = calibration
+        self.shape = shape
+        self.clock = clock
+        self.psf_index = psf_index
+        self._audience = audience
+        self._consistency = None if timed else consistency
         with ThreadPoolExecutor(1, "planning") as aside:
             refractor = None
             if refract and can_estimate_refraction(calibration):
@@ -274,7 +281,8 @@ class Reconstructor:
         self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
         self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
-        self._find_cost, self._refocus_cost = DurationEstimate(), DurationEstimate()
+        self._find_cost = DurationEstimate()
+        self._refocus_cost = DurationEstimate()
         self._cylinder_cost = DurationEstimate()
         self._gain = None if self.refractor is None else PsfGain(self.stages[-1].model)
         if timed:
@@ -287,12 +295,11 @@ class Reconstructor:
         self(noise, rounds=1)  # compiles, if the cache of compiled code is empty
         self(noise, np.zeros_like(noise), quick=True)  # a dark frame selects another compiled signature
         for stage in self.stages:
-            stage.start_cost, stage.round_cost, stage.finish_cost = (
-                DurationEstimate(),
-                DurationEstimate(),
-                DurationEstimate(),
-            )
-        self._find_cost, self._cylinder_cost = DurationEstimate(), DurationEstimate()
+            stage.start_cost = DurationEstimate()
+            stage.round_cost = DurationEstimate()
+            stage.finish_cost = DurationEstimate()
+        self._find_cost = DurationEstimate()
+        self._cylinder_cost = DurationEstimate()
         self(noise, rounds=2)
         for eye in (Wavefront(1.0), None):
             self._refocus(eye)
@@ -394,7 +401,8 @@ class Reconstructor:
             The frame has another shape than the sensor, or too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
-        run, task = _Run(self, counts, dark, deadline, rounds), refraction
+        run = _Run(self, counts, dark, deadline, rounds)
+        task = refraction
         check: Check | None = None
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
@@ -474,7 +482,8 @@ class Reconstructor:
         `task`: that of the frame, if it has begun; `others`: the other frames of its burst. Return the task, None
         without a refractor or without time.
         """
-        begin_s, eye = self.clock.now_s(), None
+        begin_s = self.clock.now_s()
+        eye = None
         if self.refractor is None:
             return None
         cost_s = self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
@@ -483,7 +492,7 @@ class Reconstructor:
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
             assert task is not None
             if others and run.deadline is None:
-                task.join([plane(one, 0) for one in others])
+                task.join([plane(other, 0) for other in others])
             run.refraction = task.found()
             self._find_cost.add(task.find_s)
             self._take_cylinder(run, task, wait=run.deadline is None)
@@ -529,14 +538,10 @@ class Reconstructor:
 
     def _report(self, run: "_Run", seconds: dict[str, float], check: Check | None) -> Report:
         assert run.solved is not None
-        recipe, diagnostics, frame = run.done.recipe, run.solved.diagnostics, run.solved.frame
-        dark = not frame.mean_dn > 0 or diagnostics.noise_dn == 0
-        quality: dict[str, float | None] = {
-            "saturated": frame.saturated,
-            "missing": frame.missing,
-            "mean_dn": frame.mean_dn,
-            **diagnostics.quality,
-        }
+        recipe = run.done.recipe
+        diagnostics = run.solved.diagnostics
+        dark = not run.solved.frame.mean_dn > 0 or diagnostics.noise_dn == 0
+        quality = run.solved.quality
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
         psf_scale = self._psf_scale(run.eye)
         match = psf_match(quality)
@@ -579,12 +584,16 @@ class Reconstructor:
 
     def _psf_cylinder(self, run: "_Run") -> dict[str, float | None] | None:
         """Return `psf_cylinder` of the report: the cylinder of the picture's PSF, and its gain if it is predicted."""
-        eye, stage = run.eye, run.done
+        eye = run.eye
+        stage = run.done
         if eye is None or eye == Wavefront(eye.m_dpt) or self.refractor is None or self._gain is None:
             return None
         assert run.solved is not None
-        figures, noise_dn = run.solved.diagnostics.regularisation, run.solved.diagnostics.noise_dn
-        log_power, slope, gain_db = figures.get("prior_log_power"), figures.get("prior_slope"), None
+        figures = run.solved.diagnostics.regularisation
+        noise_dn = run.solved.diagnostics.noise_dn
+        log_power = figures.get("prior_log_power")
+        slope = figures.get("prior_slope")
+        gain_db = None
         if log_power is not None and slope is not None and noise_dn:
             other = self.refractor.otf(stage.model, Wavefront(eye.m_dpt))
             gain_db = self._gain(stage.model.otf, other, PowerLaw(log_power, slope), noise_dn)
@@ -606,6 +615,12 @@ class _Solved:
     frame: Linear
     diagnostics: Diagnostics
 
+    @property
+    def quality(self) -> dict[str, float | None]:
+        """Figures of the frame and of the solver by their names in a report."""
+        figures = {"saturated": self.frame.saturated, "missing": self.frame.missing, "mean_dn": self.frame.mean_dn}
+        return {**figures, **self.diagnostics.quality}
+
 
 class _Run:
     """State of the reconstruction of one frame."""
@@ -613,13 +628,17 @@ class _Run:
     def __init__(
         self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
     ) -> None:
-        self.clock, self.counts, self.dark = owner.clock, counts, dark
+        self.clock = owner.clock
+        self.counts = counts
+        self.dark = dark
         self._defects = owner.defects
         self._found: dict[int, Places | None] = {}
-        self.deadline, self.most = deadline, most
+        self.deadline = deadline
+        self.most = most
         self.done: _Stage = owner.stages[0]
         self.solved: _Solved | None = None  # None before the first stage
-        self.rounds_done, self.stopped = 0, "done"
+        self.rounds_done = 0
+        self.stopped = "done"
         self.refraction: Refraction | NoRefraction | None = None
         self.refraction_s = self.cylinder_s = self.between_s = 0.0
         self.eye: Wavefront | None = None  # of the PSF of the last stage
@@ -643,7 +662,8 @@ class _Run:
 
     def channel(self, c: int) -> ChannelFrame:
         """Return counts, dark frame (or None) and defective pixels of channel `c`; defects are searched only once."""
-        counts, dark = plane(self.counts, c), None if self.dark is None else plane(self.dark, c)
+        counts = plane(self.counts, c)
+        dark = None if self.dark is None else plane(self.dark, c)
         if c not in self._found:
             self._found[c] = self._defects(counts, dark)
         return counts, dark, self._found[c]
@@ -671,7 +691,8 @@ class _Run:
             stage.planes = np.zeros((self.channels, *stage.grid.shape), np.float32)
         for c in range(self.channels):
             yield from self._channel(stage, c, pauses, joined)
-        self.done, self.eye = stage, stage.eye
+        self.done = stage
+        self.eye = stage.eye
 
     def _channel(self, stage: _Stage, c: int, pauses: bool, joined: Image | None) -> Iterator[RoundDone]:
         """Solve one channel of a stage; the diagnostics of the last channel are those of the frame."""

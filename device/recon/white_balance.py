@@ -31,7 +31,7 @@ def light_dn_per_s(counts: Pixels, dark: Pixels | None, calibration: Calibration
     elif calibration.dark_dn is not None:
         level = calibration.dark_dn
     maps = (level, calibration.bad)
-    if any(not isinstance(one, float | int) and one is not None and one.shape != counts.shape for one in maps):
+    if any(not isinstance(array, float | int) and array is not None and array.shape != counts.shape for array in maps):
         return nan
     if calibration.bad is None:
         return (_mean(counts) - _mean(level)) / full_drive_s

@@ -179,7 +179,7 @@ class RenderedEyes:
 
 def lit_deg(scene: Scene, plan: Sequence[Decision]) -> float:
     """Return the full angle beyond which no light arrives, degrees: the field's, wider if the penumbra is simulated."""
-    soft = any(one.simulated and one.name == Penumbra.name for one in plan)
+    soft = any(decision.simulated and decision.name == Penumbra.name for decision in plan)
     return scene.lit_deg if soft else scene.optics.field_deg
 
 

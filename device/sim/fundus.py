@@ -166,7 +166,7 @@ def _paint(
         tissue *= 1 + EXUDATE[colour] * lesions.bright * (1 - disc)
         blood = pigments.blood(BLOOD[colour]) * (1 - 0.25 * disc)
         through = (1 - blood * veins.blood) * (1 - ARTERY * blood * arteries.blood) * (1 - blood * lesions.dark)
-        planes[colour] = np.float32(pigments.level(colour, LEVEL[colour])) * tissue * through
+        planes[colour] = np.float32(pigments.reflectance(colour, LEVEL[colour])) * tissue * through
     return planes, veins.mask | arteries.mask
 
 

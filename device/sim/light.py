@@ -60,12 +60,12 @@ class SimLight:
         if self._world.has_fault("light.silent"):
             raise LightFault("the simulated lamp does not hear what it is told")
 
-    def _turn_on(self, glow: Illumination) -> None:
+    def _turn_on(self, illumination: Illumination) -> None:
         """Turn the lamp on; LightFault while "light.fault" or "light.silent" is active."""
         self.check()
         self._refuse_if_silent()
         self._world.lit_frames = 0
-        self._world.illumination = glow
+        self._world.illumination = illumination
 
     def check(self) -> None:
         """Turn the lamp off and raise LightFault while the fault "light.fault" is active."""

@@ -120,7 +120,7 @@ def _moved_picture(
     wide = ceil(px_per_deg * (max(wide_deg, optics.field_deg) + 2 * max(beyond_deg, more_deg))) + 4
     rows, cols = (max(wide + (wide - n) % 2, n) for n in shape)
     found = _picture(scene, eye, (rows, cols), px_per_deg, wide_deg, beyond_deg)
-    move_px, turn_px = ((one[1] * px_per_deg, one[0] * px_per_deg) for one in (at_deg, turn_deg))
+    move_px, turn_px = ((offset_deg[1] * px_per_deg, offset_deg[0] * px_per_deg) for offset_deg in (at_deg, turn_deg))
     return _crop_to_field(found, shape, px_per_deg, lit_deg / 2, move_px, turn_px)
 
 

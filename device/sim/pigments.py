@@ -29,7 +29,7 @@ class Pigments:
     macular: float = 1.0
     haemoglobin: float = 1.0
 
-    def level(self, colour: Colour, mean_reflectance: float) -> float:
+    def reflectance(self, colour: Colour, mean_reflectance: float) -> float:
         """Return the reflectance of this eye's tissue; `mean_reflectance` is the mean over persons."""
         return mean_reflectance * exp(-MELANIN[colour] * self.melanin) if self.melanin else mean_reflectance
 

@@ -73,10 +73,13 @@ def format_plan(decisions: Sequence[Decision], spent_ms: dict[str, float] | None
     """Return the plan as a text table: decision, eta, reason, and with `spent_ms` the computing time of each effect."""
     head = f"{'effect':<14} {'':<9} {'eta':>8} {'ms':>7}  why"
     lines = [head]
-    for one in decisions:
-        cost = "" if spent_ms is None or not one.simulated else f"{spent_ms.get(one.name, 0.0):.0f}"
-        eta = "0" if one.eta == 0 else f"{one.eta:.3g}"
-        lines.append(f"{one.name:<14} {'simulated' if one.simulated else 'skipped':<9} {eta:>8} {cost:>7}  {one.why}")
+    for decision in decisions:
+        cost = "" if spent_ms is None or not decision.simulated else f"{spent_ms.get(decision.name, 0.0):.0f}"
+        eta = "0" if decision.eta == 0 else f"{decision.eta:.3g}"
+        lines.append(
+            f"{decision.name:<14} {'simulated' if decision.simulated else 'skipped':<9} {eta:>8} {cost:>7}  "
+            f"{decision.why}"
+        )
     lines.append(
         f"eta: change of the picture over its noise; without --all, --only and --without, effects from "
         f"{ETA_THRESHOLD:g} (1/20) on are simulated"

@@ -154,14 +154,14 @@ class ReplayCamera:
         if into is not None and (into.shape != self._dark.shape or into.dtype != np.uint16):
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this recording fills uint16 {self._dark.shape}")
         self._clock.sleep(shot.exposure_s)
-        glow = self._light.illumination
-        counts = self._dark if glow is None else self._frames[self._shown % len(self._frames)]
-        self._shown += glow is not None
+        illumination = self._light.illumination
+        counts = self._dark if illumination is None else self._frames[self._shown % len(self._frames)]
+        self._shown += illumination is not None
         self._number += 1
         if into is not None:
             into[...] = counts
             counts = into
-        return Frame(counts, shot.exposure_s, self._number, glow, self._simulated)
+        return Frame(counts, shot.exposure_s, self._number, illumination, self._simulated)
 
     def prepare(self, shot: ExposureSettings) -> None:
         """Do nothing: recorded frames do not depend on the exposure time."""

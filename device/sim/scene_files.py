@@ -106,13 +106,13 @@ def write(world: World, frames: Sequence[Counts], folder: Path) -> None:
 def plan_as_json(plan: tuple[Decision, ...], spent_ms: dict[str, float]) -> dict[str, dict[str, Any]]:
     """Return by effect name: simulated or not, eta, the text that explains eta, and the computing time in ms."""
     return {
-        one.name: {
-            "simulated": one.simulated,
-            "eta": one.eta,
-            "why": one.why,
-            "cost_ms": round(spent_ms.get(one.name, 0.0), 1) if one.simulated else 0.0,
+        decision.name: {
+            "simulated": decision.simulated,
+            "eta": decision.eta,
+            "why": decision.why,
+            "cost_ms": round(spent_ms.get(decision.name, 0.0), 1) if decision.simulated else 0.0,
         }
-        for one in plan
+        for decision in plan
     }
 
 

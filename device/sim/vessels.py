@@ -139,7 +139,7 @@ def _grown(garden: GrowthState, waiting: list[tuple[Tip, Path]]) -> tuple[list[V
     vessels = []
     left = []
     while waiting:
-        waiting.sort(key=lambda one: -one[0].width_deg)
+        waiting.sort(key=lambda item: -item[0].width_deg)
         tip, before = waiting.pop(0)
         points = [*before, (tip.x, tip.y, tip.width_deg)]
         for branch in _lengthen(garden, tip, points):

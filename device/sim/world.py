@@ -158,20 +158,20 @@ class World:
             return (target + np.float32(self.dark_e_per_s)) * np.float32(exposure_s)
         unlit_e_per_s = self.dark_e_per_s + self._ambient_light_e_per_s + self.ambient_e_per_s
         unlit_e = np.asarray(unlit_e_per_s * exposure_s, np.float32)
-        glow = self.illumination  # read once: the guard's thread may turn the lamp off at any time
-        if glow is None:
+        illumination = self.illumination  # read once: the guard's thread may turn the lamp off at any time
+        if illumination is None:
             return np.broadcast_to(unlit_e, self.shape)
         step, parts = 0, 1
-        if glow.colour == self.spec.light.colour:
+        if illumination.colour == self.spec.light.colour:
             step = self.lit_frames if self.eyes.moves else 0
             parts = self.eyes.parts(exposure_s)
-        returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step, parts)
+        returned: Image | float = self.eyes.electrons_per_s(self.eye, illumination.colour, step, parts)
         begin_s = self.clock.now_s() - exposure_s if begin_s is None else begin_s
         closed = 1.0 if self.has_fault("eye.closed") else lid_share(self.scene, max(begin_s, 0.0), exposure_s)
         if closed > 0:
             lid = np.full(self.shape, np.mean(returned), np.float32)
             returned = lid if closed == 1 else np.float32(closed) * lid + np.float32(1 - closed) * returned
-        return returned * np.float32(glow.level * exposure_s) + unlit_e
+        return returned * np.float32(illumination.level * exposure_s) + unlit_e
 
     @property
     def dark_e_per_s(self) -> float:

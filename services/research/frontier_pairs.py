@@ -107,8 +107,11 @@ def frontier_of_dataset(
     A pair that fails is in `left_out`; the others go on. FrameError if none is left. StoreError for an unwritable file.
     """
     dataset = selected(request.dataset, request.limit)
-    frontiers, scores, left_out = [], [], []
-    planner, methods = Planner(request.plans), selected_methods(request.methods)
+    frontiers = []
+    scores = []
+    left_out = []
+    planner = Planner(request.plans)
+    methods = selected_methods(request.methods)
     for k, entry in enumerate(dataset.entries, 1):
         progress(f"{k} of {len(dataset)}: {entry.name}")
         try:
@@ -130,21 +133,28 @@ def frontier_of_dataset(
             f"no pair of {dataset.folder} can be measured: {'; '.join(map(str, left_out))}",
             "Give pairs with truths; `diffuscope data FOLDER --check` names what is missing.",
         )
-    result = DatasetFrontier(
+    result = _joined(dataset.layout.title, request.budget_s, frontiers, scores, left_out)
+    _write(request, result, draw_frontier(mean_frontier(result), methods))
+    return result
+
+
+def _joined(
+    title: str, budget_s: float, frontiers: list[Frontier], scores: list[PairScore], left_out: list[LeftOut]
+) -> DatasetFrontier:
+    """Return the frontiers of all pairs of a data set, with the mean scores of each method."""
+    return DatasetFrontier(
         this_machine(),
         versions(),
-        dataset.layout.title,
+        title,
         tuple(found.scene for found in frontiers),
         FIT,
         RANGE,
         "mean of the channels",
-        request.budget_s,
+        budget_s,
         _sorted(rows(scores)),
         tuple(left_out),
         tuple(frontiers),
     )
-    _write(request, result, draw_frontier(mean_frontier(result), methods))
-    return result
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class MeterRun:
     """
 
     spec: InstrumentSpec
-    glow: Illumination
+    illumination: Illumination
     on_s: float
     count: int
     expected_uw: float
@@ -68,8 +68,8 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     design = design_of(spec)
     hazard = hazard_of(spec)
     colour = spec.light.colour
-    glow = hazard.brightest(colour) if level is None else Illumination(colour, level)
-    hazard.refuse(glow)
+    illumination = hazard.brightest(colour) if level is None else Illumination(colour, level)
+    hazard.refuse(illumination)
     limits = hazard.limits
     beam = hazard.beams[colour]
     spectrum = beam.wavelength_um, beam.fwhm_um or LED_FWHM_UM
@@ -81,11 +81,11 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     on_s = ON_SHARE * spec.light.max_on_s
     return MeterRun(
         spec,
-        glow,
+        illumination,
         on_s,
         ceil(seconds * DUTY / on_s),
-        expected_uw=glow.level * expected_uw(design),
-        assumed_uw=glow.level * uw_per_w_per_cm2 * beam.retina_w_per_cm2,
+        expected_uw=illumination.level * expected_uw(design),
+        assumed_uw=illumination.level * uw_per_w_per_cm2 * beam.retina_w_per_cm2,
         permitted_uw=uw_per_w_per_cm2 * most_w_per_cm2 / GUARD,
     )
 
@@ -104,7 +104,7 @@ def pulse(run: MeterRun, ledger: Ledger, clock: Clock, progress: Callable[[str],
     with open_light(run.spec, clock, ledger) as light:
         for number in range(1, run.count + 1):
             begin_s = clock.now_s()
-            with light.on(run.glow):
+            with light.on(run.illumination):
                 progress(f"pulse {number} of {run.count}")
                 clock.sleep(run.on_s)
             clock.sleep(clock.now_s() - begin_s)  # as long as the lamp took in fact: no light is left to repay
@@ -129,8 +129,8 @@ def announcement(run: MeterRun) -> str:
     """Return what will shine, and what the meter should show."""
     return "\n".join(
         [
-            f"{run.spec.name}: {run.glow.colour} at {run.glow.level:g} of full drive, {run.count} pulses of "
-            f"{run.on_s:g} s with equal pauses",
+            f"{run.spec.name}: {run.illumination.colour} at {run.illumination.level:g} of full drive, "
+            f"{run.count} pulses of {run.on_s:g} s with equal pauses",
             f"through a hole of {AXIS_HOLE_MM:g} mm on the axis, {AXIS_DISTANCE_MM:g} mm behind the eye's pupil, where "
             "the reading is highest; nothing stands in the pupil:",
             f"expected {run.expected_uw:.3g} uW within a factor of two; the guard counts {run.assumed_uw:.3g} uW; "
@@ -156,7 +156,7 @@ def words(head: Path, run: MeterRun, verdict: MeterVerdict) -> str:
             f"GO at this level: {shown}, {times:.2g} times what is expected"
             + ("" if usual else "; look at polarisers, LEDs and the meter's place before you go on"),
             "Measure the brightest disc of 1 mm in the waist as well, and peak and width of the spectrum. Then:",
-            f"diffuscope light --head {head} --colour {run.glow.colour} --level {run.glow.level:g} "
+            f"diffuscope light --head {head} --colour {run.illumination.colour} --level {run.illumination.level:g} "
             f'--axis-uw {verdict.axis_uw:.4g} --waist-mw-per-cm2 W --peak-nm L --fwhm-nm B --meter "NAME, DATE"',
         ]
     )

@@ -76,11 +76,13 @@ def _colours(spec: InstrumentSpec) -> tuple[Colour, ...]:
 
 def _frames(head: Head, clock: Clock, colour: Colour) -> CardFrames:
     """Return a dark frame and FRAMES lit ones at an exposure that fills the brightest pixels."""
-    glow = head.light.hazard.brightest(colour)
+    illumination = head.light.hazard.brightest(colour)
     exposure_s = longest_s = head.spec.camera.exposure_s
     sensor = head.calibration.sensor
     for _ in range(SEARCHES):
-        bright_dn = float(np.percentile(_lit(head, clock, glow, exposure_s).counts, BRIGHTEST)) - sensor.black_dn
+        bright_dn = (
+            float(np.percentile(_lit(head, clock, illumination, exposure_s).counts, BRIGHTEST)) - sensor.black_dn
+        )
         share = bright_dn / (sensor.white_dn - sensor.black_dn)
         wanted_s = exposure_s * (1 / 8 if share > 0.95 else min(TARGET_FILL_SHARE / max(share, 1e-3), 8.0))
         wanted_s = float(np.clip(wanted_s, SHORTEST_S / 10, longest_s))
@@ -89,15 +91,15 @@ def _frames(head: Head, clock: Clock, colour: Colour) -> CardFrames:
         exposure_s = wanted_s
     dark = head.camera.expose(ExposureSettings(exposure_s))
     dark = replace(dark, counts=dark.counts.copy())
-    return CardFrames([_lit(head, clock, glow, exposure_s) for _ in range(FRAMES)], dark, glow.level)
+    return CardFrames([_lit(head, clock, illumination, exposure_s) for _ in range(FRAMES)], dark, illumination.level)
 
 
-def _lit(head: Head, clock: Clock, glow: Illumination, exposure_s: float) -> Frame:
+def _lit(head: Head, clock: Clock, illumination: Illumination, exposure_s: float) -> Frame:
     """Return one frame in the head's light, followed by as long a darkness: the guard asks for it."""
     shot = ExposureSettings(exposure_s)
     head.camera.prepare(shot)
     begin_s = clock.now_s()
-    with head.light.on(glow):
+    with head.light.on(illumination):
         frame = require_lit(head.camera.expose(shot))
     clock.sleep(clock.now_s() - begin_s)
     return replace(frame, counts=frame.counts.copy())

@@ -14,11 +14,11 @@ def drawn_retina() -> Image.Image:
     rows, cols = np.mgrid[:ROWS, :COLS].astype(np.float32)
     y, x = (rows - ROWS / 2) / (FIELD_PX / 2), (cols - COLS / 2) / (FIELD_PX / 2)
     lit = (np.hypot(x, y) < 1).astype(np.float32)
-    glow = 0.55 + 0.45 * np.exp(-((x - 0.5) ** 2 + y**2) / 0.02) - 0.2 * np.exp(-((x + 0.25) ** 2 + y**2) / 0.03)
+    brightness = 0.55 + 0.45 * np.exp(-((x - 0.5) ** 2 + y**2) / 0.02) - 0.2 * np.exp(-((x + 0.25) ** 2 + y**2) / 0.03)
     for bend in (-0.9, -0.45, 0.45, 0.9):
         line = bend * np.sqrt(np.clip(0.55 - x, 0, None))
-        glow -= 0.22 * np.exp(-((y - line) ** 2) / 0.0004) * (x < 0.5)
-    colour = np.stack([glow * 205, glow * 105, glow * 50], -1) * lit[..., None]
+        brightness -= 0.22 * np.exp(-((y - line) ** 2) / 0.0004) * (x < 0.5)
+    colour = np.stack([brightness * 205, brightness * 105, brightness * 50], -1) * lit[..., None]
     return Image.fromarray(colour.clip(0, 255).astype(np.uint8))
 
 

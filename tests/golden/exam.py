@@ -55,10 +55,10 @@ class WatchedWorld(World):
         return self._shown
 
     @illumination.setter
-    def illumination(self, glow: Illumination | None) -> None:
-        if glow != self._shown:
-            self.trace.add(lamp="dark" if glow is None else f"{glow.colour} {glow.level:g}")
-        self._shown = glow
+    def illumination(self, illumination: Illumination | None) -> None:
+        if illumination != self._shown:
+            self.trace.add(lamp="dark" if illumination is None else f"{illumination.colour} {illumination.level:g}")
+        self._shown = illumination
 
 
 class ScriptedClock(GateClock):

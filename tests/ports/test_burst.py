@@ -75,8 +75,8 @@ def test_parts_that_are_shorter_by_the_overhead_are_all_taken(overhead_s, count,
     camera = SlowCamera(rig.camera, rig.clock, overhead_s)
     part = ExposureSettings((whole_s + overhead_s) / parts - overhead_s)
     begin_s = rig.clock.now_s()
-    glow = Illumination("green")
-    frames = burst(camera, light, glow, part, count, rig.clock, parts=parts, whole_s=whole_s)
+    illumination = Illumination("green")
+    frames = burst(camera, light, illumination, part, count, rig.clock, parts=parts, whole_s=whole_s)
     assert len(frames) == count * parts
     assert rig.clock.now_s() - begin_s <= count * (whole_s + overhead_s) + 1e-5  # rounding
 

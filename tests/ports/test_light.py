@@ -13,9 +13,9 @@ def test_the_light_is_off_by_default(fresh_rig):
 
 
 def test_the_light_shows_the_requested_illumination_until_the_context_ends(rig):
-    for glow in (GREEN, RED):
-        with rig.light.on(glow):
-            assert rig.light.illumination == glow
+    for illumination in (GREEN, RED):
+        with rig.light.on(illumination):
+            assert rig.light.illumination == illumination
         assert rig.light.illumination is None
 
 

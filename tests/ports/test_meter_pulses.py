@@ -55,7 +55,9 @@ def test_the_ring_shines_at_the_permitted_level_and_half_of_the_time(spec):
     for begin_s, end_s, leds in lit:
         assert end_s - begin_s >= run.on_s - late_s  # the end is the guard's: tests/unit/test_guard.py
         assert set(leds) == {"0", "1", "3", "4", "6", "7", "9", "10"}
-        assert all(abs(level - run.glow.level) <= 1 / 0xFFFF for level in leds.values())  # a step of the grey scale
+        assert all(
+            abs(level - run.illumination.level) <= 1 / 0xFFFF for level in leds.values()
+        )  # a step of the grey scale
     pauses = [later[0] - sooner[1] for sooner, later in pairwise(lit)]
     assert min(pauses) >= run.on_s - late_s
 

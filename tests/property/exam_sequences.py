@@ -189,10 +189,10 @@ class WatchedWorld(World):
         return self._shown
 
     @illumination.setter
-    def illumination(self, glow: Illumination | None) -> None:
-        self._shown = glow
-        if glow is not None:
-            self.on_light(glow)
+    def illumination(self, illumination: Illumination | None) -> None:
+        self._shown = illumination
+        if illumination is not None:
+            self.on_light(illumination)
 
 
 class HookedBus(EventBus):
@@ -370,9 +370,9 @@ class Run:
 
     # Rules
 
-    def _check_light(self, glow: Illumination) -> None:
+    def _check_light(self, illumination: Illumination) -> None:
         now = self.requests.snapshot
-        if glow.colour == self.world.spec.light.colour:
+        if illumination.colour == self.world.spec.light.colour:
             self._require(now.state in EXPOSING, "light of a capture outside its exposure")
             self._require(self._is_permitted, "light of a capture whose consent was not read")
             self._is_permitted = False

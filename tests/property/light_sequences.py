@@ -30,7 +30,7 @@ from device.errors import LightLimit, StoreError, StoreFull
 from device.head import Head, open_head
 from device.light_safety.burst import burst
 from device.light_safety.dose_ledger import DoseLedgerState, Ledger, MemoryLedger, Reserved
-from device.light_safety.guard import AFTERGLOW_S, GuardedLight
+from device.light_safety.guard import LIT_AFTER_KILL_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
 from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.values import EYES, Calibration, Colour, ExposureSettings, Eye, Frame, Illumination, Psf, Sensor
@@ -92,28 +92,28 @@ class Lamp:
     After a kill of its process (`is_orphaned`) only `close_gate` turns it off. `stretches` counts how often it went on.
     """
 
-    glow: Illumination | None = None
+    shown: Illumination | None = None
     requested: Illumination | None = None
     is_orphaned: bool = False
     stretches: int = 0
 
     @property
     def illumination(self) -> Illumination | None:
-        return self.glow
+        return self.shown
 
-    def on(self, glow: Illumination) -> "Lamp":
-        self.requested = glow
+    def on(self, illumination: Illumination) -> "Lamp":
+        self.requested = illumination
         return self
 
     def off(self) -> None:
         if not self.is_orphaned:
-            self.glow = None
+            self.shown = None
 
     def close_gate(self) -> None:
-        self.is_orphaned, self.glow = False, None
+        self.is_orphaned, self.shown = False, None
 
     def __enter__(self) -> "Lamp":
-        self.glow = self.requested
+        self.shown = self.requested
         self.stretches += 1
         return self
 
@@ -169,7 +169,7 @@ class TimedCamera:
         owner, duration_s = self.owner, self.slow * shot.exposure_s
         if owner.lamp.stretches != self._stretch:
             self._stretch, owner.lit_s = owner.lamp.stretches, 0.0
-        if owner.lamp.glow is None:
+        if owner.lamp.shown is None:
             owner.pass_true_time(duration_s)
         else:
             owner.keep_on(duration_s if self.kill_at != 0 else duration_s / 2)
@@ -213,7 +213,7 @@ class Eyes(RuleBasedStateMachine):
 
     def kill(self) -> None:
         """Kill the process: neither lamp nor ledger hear of it any more. `crash` ends it."""
-        self.tally["killed while lit" if self.lamp.glow is not None else "killed in the dark"] += 1
+        self.tally["killed while lit" if self.lamp.shown is not None else "killed in the dark"] += 1
         self.lamp.is_orphaned = self.wrapped.is_killed = True
 
     def teardown(self) -> None:
@@ -222,8 +222,8 @@ class Eyes(RuleBasedStateMachine):
 
     def pass_true_time(self, duration_s: float) -> None:
         """Advance true time, and add the dose of a lit lamp to the exposed eyes."""
-        if self.lamp.glow is not None:
-            dose = self.lamp.glow.level * TRUE_W_PER_CM2[self.lamp.glow.colour] * duration_s
+        if self.lamp.shown is not None:
+            dose = self.lamp.shown.level * TRUE_W_PER_CM2[self.lamp.shown.colour] * duration_s
             for eye in self.exposed_eyes:
                 self.received[eye].append((self.times.true_s, self.times.true_s + duration_s, dose))
                 if not self.in_visit:
@@ -236,7 +236,7 @@ class Eyes(RuleBasedStateMachine):
             yield
         except (LightLimit, StoreError):
             self.tally["refused"] += 1
-            assert self.lamp.glow is None
+            assert self.lamp.shown is None
 
     @precondition(lambda self: self.open_context is None)
     @rule(
@@ -247,7 +247,7 @@ class Eyes(RuleBasedStateMachine):
     )
     def switch_on(self, colour: Any, level: float, eyes: tuple[Eye, ...], in_visit: bool) -> None:
         context = self.guarded.on(Illumination(colour, level), eyes, in_visit=in_visit)
-        assert self.lamp.glow is None
+        assert self.lamp.shown is None
         self.exposed_eyes, self.in_visit, self.lit_s = eyes, in_visit, 0.0
         with self.lamp_is_off_after_a_refusal():
             context.__enter__()
@@ -265,7 +265,7 @@ class Eyes(RuleBasedStateMachine):
         left_s = max(0.0, MAX_ON_S - self.lit_s)
         self.pass_true_time(left_s)
         self.guarded.cut()
-        assert self.lamp.glow is None
+        assert self.lamp.shown is None
         self.lit_s = MAX_ON_S
         self.pass_true_time(duration_s - left_s)
 
@@ -280,7 +280,7 @@ class Eyes(RuleBasedStateMachine):
     def open_a_second_context(self) -> None:
         with self.lamp_is_off_after_a_refusal():
             self.guarded.on(Illumination("blue")).__enter__()
-        assert self.lamp.glow is None
+        assert self.lamp.shown is None
         self.open_context = None
 
     @rule(
@@ -316,12 +316,12 @@ class Eyes(RuleBasedStateMachine):
         camera, shot = TimedCamera(self, slow), ExposureSettings(exposure_s)
         for colour in colours:
             self.exposed_eyes, self.in_visit, self.lit_s = (eye,), in_visit, 0.0
-            light, glow = self.guarded, Illumination(colour)
+            light, illumination = self.guarded, Illumination(colour)
             with self.lamp_is_off_after_a_refusal():
-                frames = burst(camera, light, glow, shot, count, self.times, (eye,), in_visit=in_visit)
+                frames = burst(camera, light, illumination, shot, count, self.times, (eye,), in_visit=in_visit)
                 assert 1 <= len(frames) <= count
                 assert not self.disk.full, "light without a record"
-            assert self.lamp.glow is None
+            assert self.lamp.shown is None
 
     @precondition(lambda self: self.open_context is None)
     @rule(
@@ -334,7 +334,7 @@ class Eyes(RuleBasedStateMachine):
         parts=st.integers(1, 8),
         overhead_share=st.floats(0, 0.5),
         kill_at=st.one_of(st.none(), st.integers(0, 18)),
-        afterglow_s=st.floats(0, AFTERGLOW_S),
+        lit_after_kill_s=st.floats(0, LIT_AFTER_KILL_S),
     )
     def press(
         self,
@@ -347,7 +347,7 @@ class Eyes(RuleBasedStateMachine):
         parts: int,
         overhead_share: float,
         kill_at: int | None,
-        afterglow_s: float,
+        lit_after_kill_s: float,
     ) -> None:
         """Expose as a press does: a dark frame, a burst in green, other colours; a kill may come in any of them.
 
@@ -369,7 +369,7 @@ class Eyes(RuleBasedStateMachine):
                 self.tally["split press"] += parts > 1
                 self.tally[f"press of {len(made.lit)} frames and {len(made.colours)} colours"] += 1
         except Killed:
-            self.crash(0.0, afterglow_s, None)
+            self.crash(0.0, lit_after_kill_s, None)
 
     @precondition(lambda self: self.open_context is None)
     @rule(
@@ -394,15 +394,15 @@ class Eyes(RuleBasedStateMachine):
 
     @rule(
         off_s=st.one_of(st.just(0.0), st.floats(0, 2 * DAY_S)),
-        afterglow_s=st.floats(0, AFTERGLOW_S),
+        lit_after_kill_s=st.floats(0, LIT_AFTER_KILL_S),
         reboot_s=st.one_of(st.none(), st.floats(0, 10 * DAY_S)),
     )
-    def crash(self, off_s: float, afterglow_s: float, reboot_s: float | None) -> None:
+    def crash(self, off_s: float, lit_after_kill_s: float, reboot_s: float | None) -> None:
         """End the process; the lamp is on until its gate closes; `reboot_s` is the new value of the boot clock."""
         if not self.lamp.is_orphaned:
             self.kill()
         self.guarded.off()  # reaches neither lamp nor ledger, but ends the timer, as the process ends
-        self.pass_true_time(afterglow_s)
+        self.pass_true_time(lit_after_kill_s)
         self.lamp.close_gate()
         self.times.sleep(off_s)
         if reboot_s is not None:
@@ -421,7 +421,7 @@ class Eyes(RuleBasedStateMachine):
 
     @invariant()
     def lamp_is_off_without_a_context(self) -> None:
-        assert self.lamp.glow is None or self.open_context is not None
+        assert self.lamp.shown is None or self.open_context is not None
 
     @invariant()
     def no_eye_exceeds_the_dose_limit_in_any_day(self) -> None:

@@ -66,8 +66,8 @@ def press_with_frames(store: CaptureStore, press: InterruptedCapture = PRESS, li
     writer = CaptureJournal(store).begin(press, KEY, 3, ("red",))
     sink = FrameSink(writer, RawMetadata(press.id, "OD", NOON, calibration_id="00ff", head="head"), "green")
     for number, light in enumerate(lights):
-        glow = None if light == "dark" else Illumination("red" if light == "red" else "green")
-        sink(Frame(np.full((8, 9), number, np.uint16), 0.1, number, glow, True), 1e-5, 0.1)
+        illumination = None if light == "dark" else Illumination("red" if light == "red" else "green")
+        sink(Frame(np.full((8, 9), number, np.uint16), 0.1, number, illumination, True), 1e-5, 0.1)
     writer.finish()
 
 

@@ -229,8 +229,8 @@ class FailsInRed:
         self._camera.prepare(shot)
 
     def expose(self, shot: ExposureSettings) -> Frame:
-        glow = self._world.illumination
-        if glow is not None and glow.colour == "red":
+        illumination = self._world.illumination
+        if illumination is not None and illumination.colour == "red":
             self._clock.sleep(1.0)
             raise CameraStalled("no frame came")
         return self._camera.expose(shot)

@@ -14,7 +14,7 @@ import pytest
 from device.clock import VirtualClock, boot_id
 from device.errors import DailyLightLimit, LightLimit, StoreError
 from device.light_safety.dose_ledger import INTERVAL_S, MemoryLedger
-from device.light_safety.guard import AFTERGLOW_S, GuardedLight
+from device.light_safety.guard import LIT_AFTER_KILL_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
 from device.values import Illumination
 from services.records.capture_store import CaptureStore
@@ -49,7 +49,7 @@ def test_a_reservation_counts_until_it_is_settled_with_the_given_dose(store: Cap
     ledger, lamp = open_ledger(store, clock), Lamp()
     guarded = guard(lamp, clock, ledger)
     with guarded.on(GREEN, ("OS",)):
-        assert open_ledger(store, clock).spent_j_per_cm2("OS") == pytest.approx(100e-6 * (10 + AFTERGLOW_S))
+        assert open_ledger(store, clock).spent_j_per_cm2("OS") == pytest.approx(100e-6 * (10 + LIT_AFTER_KILL_S))
         clock.sleep(2)
     assert ledger.spent_j_per_cm2("OS") == pytest.approx(200e-6)
     assert guarded.given_j_per_cm2 == pytest.approx(200e-6)
@@ -163,7 +163,7 @@ def test_at_the_limit_the_lamp_stays_dark_for_that_eye_only(store: CaptureStore,
         expose()
     assert lamp.illumination is None
     # at most one reservation below the limit
-    assert 0 <= light_limits().stop_j_per_cm2 - ledger.spent_j_per_cm2("OD") < 109.5e-6 * (10 + AFTERGLOW_S)
+    assert 0 <= light_limits().stop_j_per_cm2 - ledger.spent_j_per_cm2("OD") < 109.5e-6 * (10 + LIT_AFTER_KILL_S)
     with guarded.on(GREEN, ("OS",)):
         assert lamp.illumination == GREEN
     assert guarded.dose_report().dose_high == ("OD",)
@@ -195,7 +195,7 @@ def test_a_ledger_error_during_the_light_leaves_the_reservation_counted(
         connection.execute("CREATE TRIGGER full BEFORE UPDATE ON doses BEGIN SELECT RAISE(FAIL, 'full'); END")
         connection.commit()
     assert lamp.illumination is None
-    assert ledger.spent_j_per_cm2("OD") == pytest.approx(100e-6 * (10 + AFTERGLOW_S))
+    assert ledger.spent_j_per_cm2("OD") == pytest.approx(100e-6 * (10 + LIT_AFTER_KILL_S))
     connection.close()
 
 

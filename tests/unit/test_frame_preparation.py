@@ -52,8 +52,8 @@ class Bench:
 
 
 def frame(number: int, colour: Colour | None = "green") -> Frame:
-    glow = None if colour is None else Illumination(colour)
-    return Frame(np.full((2, 2), number, np.uint16), 0.1, number, glow, True)
+    illumination = None if colour is None else Illumination(colour)
+    return Frame(np.full((2, 2), number, np.uint16), 0.1, number, illumination, True)
 
 
 def test_lit_frames_of_the_burst_are_prepared_with_the_dark_frame_in_a_thread() -> None:

@@ -23,8 +23,8 @@ class Lamp:
         self.slow_s, self.broken = slow_s, False
         self.history: list[Illumination | None] = []
 
-    def on(self, glow: Illumination) -> "Lamp":
-        self.asked = glow
+    def on(self, illumination: Illumination) -> "Lamp":
+        self.asked = illumination
         return self
 
     def off(self) -> None:

@@ -45,10 +45,12 @@ def test_no_limit_is_marked_as_checked_yet() -> None:
 def test_the_photochemical_figures_of_the_budget(
     hazard: Hazard, colour: str, uw_per_cm2: float, seconds: float
 ) -> None:
-    glow = Illumination(colour)
-    assert hazard.photochemical_w_per_cm2(glow) * 1e6 == pytest.approx(uw_per_cm2, rel=0.015)
-    assert hazard.limits.stop_j_per_cm2 / hazard.photochemical_w_per_cm2(glow) == pytest.approx(seconds, rel=0.015)
-    assert hazard.dose_j_per_cm2(glow, seconds) == pytest.approx(0.1584, rel=0.015)
+    illumination = Illumination(colour)
+    assert hazard.photochemical_w_per_cm2(illumination) * 1e6 == pytest.approx(uw_per_cm2, rel=0.015)
+    assert hazard.limits.stop_j_per_cm2 / hazard.photochemical_w_per_cm2(illumination) == pytest.approx(
+        seconds, rel=0.015
+    )
+    assert hazard.dose_j_per_cm2(illumination, seconds) == pytest.approx(0.1584, rel=0.015)
 
 
 def test_ten_flashes_of_each_colour_are_0_05_percent_of_the_daily_dose(hazard: Hazard) -> None:

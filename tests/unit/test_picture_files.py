@@ -228,21 +228,23 @@ def test_stored_metadata_are_read_whole_and_written_to_the_same_bytes() -> None:
         with tifffile.TiffFile(path) as tiff:
             written = tiff.pages.first.description
         metadata = read_raw_tiff(path.read_bytes())[1]
-        glow = Illumination("red" if path.name == "raw-red.tiff" else "green")
-        assert metadata.illumination == (glow if path.name.startswith("raw") else None)
+        illumination = Illumination("red" if path.name == "raw-red.tiff" else "green")
+        assert metadata.illumination == (illumination if path.name.startswith("raw") else None)
         assert metadata.id == path.parent.name
         assert metadata_entries(metadata) == json.loads(written)
 
 
-@pytest.mark.parametrize("glow", ["green", {}, {"colour": "green", "level": 2.0}, {"colour": "white", "level": 1.0}])
-def test_metadata_of_another_type_are_unknown(glow: object) -> None:
+@pytest.mark.parametrize(
+    "illumination", ["green", {}, {"colour": "green", "level": 2.0}, {"colour": "white", "level": 1.0}]
+)
+def test_metadata_of_another_type_are_unknown(illumination: object) -> None:
     """A raw frame whose metadata are incomplete can still be reconstructed."""
     wrong = {
         "id": 7,
         "eye": "left",
         "taken_at": "yesterday",
         "exposure_s": "0.1",
-        "glow": glow,
+        "glow": illumination,
         "simulated": "true",
         "calibration_id": [],
         "head": {},

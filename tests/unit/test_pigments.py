@@ -15,7 +15,7 @@ colours = st.sampled_from(COLOURS)
 @pytest.mark.parametrize("colour", COLOURS)
 def test_the_mean_eye_is_that_of_the_table_to_the_last_bit(colour: Colour) -> None:
     mean = Pigments()
-    assert mean.level(colour, LEVEL[colour]) == LEVEL[colour]
+    assert mean.reflectance(colour, LEVEL[colour]) == LEVEL[colour]
     assert mean.macula(colour, MACULA[colour]) == MACULA[colour]
     assert mean.blood(BLOOD[colour]) == BLOOD[colour]
     assert mean.choroid(colour, CHOROID[colour]) == CHOROID[colour]
@@ -24,8 +24,8 @@ def test_the_mean_eye_is_that_of_the_table_to_the_last_bit(colour: Colour) -> No
 def test_melanin_varies_the_reflectance_as_between_persons() -> None:
     """OPTICS.md 4.1: 25 % below 575 nm and 50 % above 600 nm."""
     for colour, factor in (("red", 1.5), ("green", 1.25), ("blue", 1.25)):
-        assert Pigments(melanin=-1).level(colour, 1.0) == pytest.approx(factor, rel=0.01)
-        assert Pigments(melanin=1).level(colour, 1.0) == pytest.approx(1 / factor, rel=0.01)
+        assert Pigments(melanin=-1).reflectance(colour, 1.0) == pytest.approx(factor, rel=0.01)
+        assert Pigments(melanin=1).reflectance(colour, 1.0) == pytest.approx(1 / factor, rel=0.01)
 
 
 @given(colours, st.floats(0, 3), st.floats(0, 3))

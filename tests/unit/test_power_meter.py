@@ -13,7 +13,7 @@ from device.config.head_file import InstrumentSpec, load_head
 from device.errors import LightLimit, SettingError, SpecError
 from device.head import hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
-from device.light_safety.guard import AFTERGLOW_S
+from device.light_safety.guard import LIT_AFTER_KILL_S
 from device.light_safety.hazard import light_limits
 from device.values import EYES
 from services.cli import app
@@ -30,7 +30,7 @@ SIM = InstrumentSpec.model_validate(tomllib.loads(small_head_toml("small")))
 
 def test_an_unmeasured_ring_shines_no_brighter_than_the_guard_permits() -> None:
     run = run_of(POWER, None, 20)
-    assert run.glow.level == pytest.approx(0.252)
+    assert run.illumination.level == pytest.approx(0.252)
     assert run.count * run.on_s == pytest.approx(10, abs=run.on_s), "half of 20 s are lit"
     assert run.on_s < POWER.light.max_on_s
     with pytest.raises(LightLimit, match="brighter than an eye may see"):
@@ -68,8 +68,8 @@ def test_guide_has_the_runs_that_a_day_permits(head: str, colours: tuple[str, ..
     runs = {"green": "-", "amber": "-", "red": "-"}
     for colour in colours:
         run = run_of(in_colour(spec, colour), None, 120)
-        second = hazard_of(run.spec).dose_j_per_cm2(run.glow, 1)
-        reserved = second * (run.spec.light.max_on_s + AFTERGLOW_S - run.on_s)
+        second = hazard_of(run.spec).dose_j_per_cm2(run.illumination, 1)
+        reserved = second * (run.spec.light.max_on_s + LIT_AFTER_KILL_S - run.on_s)
         runs[colour] = f"{(stop_j_per_cm2 - reserved) // (second * run.on_s * run.count):.0f}"
     row = re.search(rf"^\| `heads/{head}.toml` \| (\S+) \| (\S+) \| (\S+) \| ", text("hardware/assembly.md"), re.M)
     assert row is not None

@@ -109,9 +109,13 @@ def check(
     now: datetime,
 ) -> tuple[Finding, ...]:
     """Return the findings on age, PSF, field, refraction and darks for which the data suffice; input in any order."""
-    recent = sorted(assessments, key=lambda one: one.taken_at)
-    statements = [one.statement for one in recent if one.statement is not None and one.statement.sd <= MAX_SCORE_SD]
-    fitting = [one for one in statements if one.upper_limit >= MIN_SCORE][-RECENT_CAPTURES:]
+    recent = sorted(assessments, key=lambda assessment: assessment.taken_at)
+    statements = [
+        assessment.statement
+        for assessment in recent
+        if assessment.statement is not None and assessment.statement.sd <= MAX_SCORE_SD
+    ]
+    fitting = [statement for statement in statements if statement.upper_limit >= MIN_SCORE][-RECENT_CAPTURES:]
     found = [check_age(provenance, now)] if provenance is not None else []
     if statements:
         found.append(_psf_finding(statements[-RECENT_CAPTURES:]))
@@ -119,30 +123,30 @@ def check(
         found += _field_findings(fitting)
     sittings = _sittings(refractions)
     if len(sittings) >= MIN_SITTINGS:
-        found.append(_scale_finding([median(one.sphere_dpt for one in sitting) for sitting in sittings]))
-    measured = [one for one in refractions if one.field_deg_sd > 0]
+        found.append(_scale_finding([median(refraction.sphere_dpt for refraction in sitting) for sitting in sittings]))
+    measured = [refraction for refraction in refractions if refraction.field_deg_sd > 0]
     if calibration.field_deg is not None and len(eyes := _sittings(measured)) >= MIN_EDGE_SITTINGS:
         found.append(_edge_finding(calibration.field_deg, eyes))
     if recent:
-        found += _dark_findings(calibration, [one.dark for one in recent[-RECENT_CAPTURES:]])
+        found += _dark_findings(calibration, [assessment.dark for assessment in recent[-RECENT_CAPTURES:]])
     return tuple(found)
 
 
 def raise_on_failure(findings: Sequence[Finding]) -> None:
     """Raise CalibrationExpired (age) or CalibrationStale (all others) for the first finding that fails, if any."""
-    for one in findings:
-        if not one.fails:
+    for finding in findings:
+        if not finding.fails:
             continue
-        message = f"{one.name}: {one.value:.3g} {one.unit}".rstrip() + f" (limit {one.limit:.3g})"
-        if one.name == "age":
+        message = f"{finding.name}: {finding.value:.3g} {finding.unit}".rstrip() + f" (limit {finding.limit:.3g})"
+        if finding.name == "age":
             raise CalibrationExpired(f"the calibration is too old, {message}")
         raise CalibrationStale(f"the calibration no longer fits this head, {message}")
 
 
 def _psf_finding(statements: Sequence[PsfMatchResult]) -> Finding:
     """Return the PSF finding of the last captures: failed if two do not match, a hint if only the newest does not."""
-    doubts = sum(one.upper_limit < MIN_SCORE for one in statements)
-    value = median(one.upper_limit for one in statements)
+    doubts = sum(statement.upper_limit < MIN_SCORE for statement in statements)
+    value = median(statement.upper_limit for statement in statements)
     if doubts >= MIN_FAILED_CAPTURES:
         return Finding("psf", False, value, MIN_SCORE, "of 1", CALIBRATE_REMEDY)
     if statements[-1].upper_limit < MIN_SCORE:
@@ -155,8 +159,12 @@ def _field_findings(statements: Sequence[PsfMatchResult]) -> list[Finding]:
 
     None for a field without a sharp edge.
     """
-    offsets_deg = [one.field_offset_deg for one in statements if one.field_offset_deg is not None]
-    changes = [one.field_radius_change_ratio for one in statements if one.field_radius_change_ratio is not None]
+    offsets_deg = [statement.field_offset_deg for statement in statements if statement.field_offset_deg is not None]
+    changes = [
+        statement.field_radius_change_ratio
+        for statement in statements
+        if statement.field_radius_change_ratio is not None
+    ]
     if not offsets_deg or not changes:
         return []
     down, right = (median(offset[axis] for offset in offsets_deg) for axis in (0, 1))
@@ -198,8 +206,10 @@ def _edge_finding(calibrated_deg: float, sittings: Sequence[Sequence[ReportedRef
 
     The sd of the median comes from the reported ones.
     """
-    found_deg = [median(one.field_deg for one in sitting) for sitting in sittings]
-    variance_deg2 = float(np.mean([median(one.field_deg_sd for one in sitting) ** 2 for sitting in sittings]))
+    found_deg = [median(refraction.field_deg for refraction in sitting) for sitting in sittings]
+    variance_deg2 = float(
+        np.mean([median(refraction.field_deg_sd for refraction in sitting) ** 2 for sitting in sittings])
+    )
     limit_deg = EDGE_SLACK_DEG + 2 * 1.25 * (variance_deg2 / len(sittings)) ** 0.5
     return _hint(
         "edge",
@@ -214,20 +224,20 @@ def _edge_finding(calibrated_deg: float, sittings: Sequence[Sequence[ReportedRef
 def _sittings(refractions: Sequence[ReportedRefraction]) -> list[list[ReportedRefraction]]:
     """Return the refractions of each sitting: captures at most 10 minutes apart count as one patient."""
     sittings: list[list[ReportedRefraction]] = []
-    for one in sorted(refractions, key=lambda one: one.taken_at):
-        if not sittings or one.taken_at - sittings[-1][-1].taken_at > SITTING_GAP:
+    for refraction in sorted(refractions, key=lambda refraction: refraction.taken_at):
+        if not sittings or refraction.taken_at - sittings[-1][-1].taken_at > SITTING_GAP:
             sittings.append([])
-        sittings[-1].append(one)
+        sittings[-1].append(refraction)
     return sittings
 
 
 def _dark_findings(calibration: Calibration, darks: Sequence[DarkFrameAssessment]) -> list[Finding]:
     """Return the findings on hot pixels, black level and, where the calibration has it, noise of the dark frames."""
     pixels = calibration.psfs[0].pixels.size
-    seen = np.unique(np.concatenate([one.hot for one in darks]), return_counts=True)[1]
+    seen = np.unique(np.concatenate([dark.hot for dark in darks]), return_counts=True)[1]
     hot = float((seen >= min(MIN_FAILED_CAPTURES, len(darks))).sum()) / pixels
-    off_dn = abs(median(one.black_off_dn for one in darks))
-    warmth_dn = median(one.dark_current_dn for one in darks)
+    off_dn = abs(median(dark.black_off_dn for dark in darks))
+    warmth_dn = median(dark.dark_current_dn for dark in darks)
     found = [
         _hot_pixel_finding(hot),
         _hint(
@@ -239,7 +249,7 @@ def _dark_findings(calibration: Calibration, darks: Sequence[DarkFrameAssessment
             "has a dark frame of its own, so it stays true; but shade the head, let it cool, and look again.",
         ),
     ]
-    noises = [one.noise_ratio for one in darks if one.noise_ratio is not None]
+    noises = [dark.noise_ratio for dark in darks if dark.noise_ratio is not None]
     if noises:
         remedy = "The sensor is noisier than it was: shade the head, let it cool, and look again."
         found.append(_hint("dark noise", median(noises), MAX_NOISE_RATIO, "times", remedy))

@@ -213,7 +213,7 @@ class CalibrationSequence:
             if moved_mm not in seen:  # loaded from its checkpoint
                 seen[moved_mm] = similarity_of_points(point, there, pitch_um)
         try:
-            found = fit_dioptre_scale({moved_mm: one.scale for moved_mm, one in seen.items()}, eye_mm)
+            found = fit_dioptre_scale({moved_mm: seen_point.scale for moved_mm, seen_point in seen.items()}, eye_mm)
         except CalibrationRefused:
             self.checkpoints.discard(*(stand.replace(" ", "") for stand in AXIAL_OFFSETS_MM))
             raise

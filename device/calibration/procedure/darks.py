@@ -62,13 +62,13 @@ def measure_darks(exposures: Sequence[Moments], map_s: float, white_dn: float) -
     """
     if len(exposures) < 2:
         raise CalibrationRefused("darks at one exposure only say nothing about warmth", "Take two exposures or more.")
-    for one in exposures:
-        _refuse_brightness(one, white_dn)
-    shortest = min(exposures, key=lambda one: one.exposure_s)
-    mapped = min(exposures, key=lambda one: abs(one.exposure_s - map_s))
+    for exposure in exposures:
+        _refuse_brightness(exposure, white_dn)
+    shortest = min(exposures, key=lambda exposure: exposure.exposure_s)
+    mapped = min(exposures, key=lambda exposure: abs(exposure.exposure_s - map_s))
     hot = hot_pixels(exposures)
-    levels = [_fit_level(one, hot) for one in exposures]
-    times_s = np.array([one.exposure_s for one in exposures])
+    levels = [_fit_level(exposure, hot) for exposure in exposures]
+    times_s = np.array([exposure.exposure_s for exposure in exposures])
     dark_dn_per_s, black_dn = np.polyfit(times_s, [level for level, _ in levels], 1)
     _refuse_light(exposures, hot, float(dark_dn_per_s * np.ptp(times_s)), white_dn)
     total_dn = levels[exposures.index(shortest)][1]
@@ -85,9 +85,9 @@ def measure_darks(exposures: Sequence[Moments], map_s: float, white_dn: float) -
 def hot_pixels(exposures: Sequence[Moments]) -> Mask:
     """Return the mask (rows, cols) of pixels over 6 sigma plus one count from the median of any exposure's mean."""
     hot = np.zeros(exposures[0].shape, np.bool_)
-    for one in exposures:
-        low, middle, high = np.percentile(one.mean_dn, (15.87, 50.0, 84.13))
-        hot |= np.abs(one.mean_dn - np.float32(middle)) > 1.0 + HOT_SIGMAS * (high - low) / 2
+    for exposure in exposures:
+        low, middle, high = np.percentile(exposure.mean_dn, (15.87, 50.0, 84.13))
+        hot |= np.abs(exposure.mean_dn - np.float32(middle)) > 1.0 + HOT_SIGMAS * (high - low) / 2
     return hot
 
 
@@ -113,7 +113,7 @@ def fit_normal(mean_dn: float, variance_dn2: float) -> tuple[float, float]:
     starts.append((mean_dn, sqrt(max(variance_dn2 - 1 / 12, 0.04))))
     box = ([mean_dn - 1, MIN_SIGMA_DN], [mean_dn + 1, 2 * sqrt(variance_dn2) + 1])
     tried = [least_squares(miss, start, bounds=box, xtol=1e-12, ftol=1e-14) for start in starts]
-    found = min(tried, key=lambda one: float(one.cost))
+    found = min(tried, key=lambda fit: float(fit.cost))
     return float(found.x[0]), float(found.x[1])
 
 
@@ -154,19 +154,19 @@ def read_noise_dn(mean_dn: float, total_dn: float, temporal_dn2: float) -> float
     return float(brentq(miss, MIN_SIGMA_DN / 2, total_dn, xtol=1e-6)) if miss(MIN_SIGMA_DN / 2) < 0 else MIN_SIGMA_DN
 
 
-def _fit_level(one: Moments, hot: Mask) -> tuple[float, float]:
+def _fit_level(exposure: Moments, hot: Mask) -> tuple[float, float]:
     """Return level and total spread of the good pixels, DN: temporal noise and fixed pattern; CalibrationRefused."""
     good = ~hot
-    means = one.mean_dn[good].astype(np.float64)
+    means = exposure.mean_dn[good].astype(np.float64)
     mean_dn = float(means.mean())
-    within = _temporal(one, hot) * (one.count - 1) / one.count
+    within = _temporal(exposure, hot) * (exposure.count - 1) / exposure.count
     variance_dn2 = float(means.var()) + within
     if variance_dn2 == 0:
         raise CalibrationRefused(
             f"every dark frame is the same, {mean_dn:.0f} DN in every pixel: no sensor is without noise",
             "The camera does not give raw counts, or its black level is cut off. Check its driver.",
         )
-    samples = int(good.sum()) * one.count
+    samples = int(good.sum()) * exposure.count
     return (
         widest_normal(mean_dn, samples)
         if has_two_counts_only(mean_dn, variance_dn2, samples)
@@ -174,20 +174,20 @@ def _fit_level(one: Moments, hot: Mask) -> tuple[float, float]:
     )
 
 
-def _temporal(one: Moments, hot: Mask) -> float:
+def _temporal(exposure: Moments, hot: Mask) -> float:
     """Return the mean temporal variance of the good pixels, DN squared."""
-    return float(one.variance_dn2[~hot].mean(dtype=np.float64))
+    return float(exposure.variance_dn2[~hot].mean(dtype=np.float64))
 
 
-def _refuse_brightness(one: Moments, white_dn: float) -> None:
+def _refuse_brightness(exposure: Moments, white_dn: float) -> None:
     """Raise CalibrationRefused if the median pixel is above half of the converter range."""
-    if (middle_dn := float(np.median(one.mean_dn))) > white_dn / 2:
+    if (middle_dn := float(np.median(exposure.mean_dn))) > white_dn / 2:
         raise CalibrationRefused(f"the dark frames are bright: {middle_dn:.0f} of {white_dn:.0f} DN", DARKEN_REMEDY)
 
 
 def _refuse_light(exposures: Sequence[Moments], hot: Mask, rise_dn: float, white_dn: float) -> None:
     """Raise CalibrationRefused for too many hot pixels, too large a rise with the exposure, or a brighter part."""
-    longest = max(exposures, key=lambda one: one.exposure_s)
+    longest = max(exposures, key=lambda exposure: exposure.exposure_s)
     remedy = DARKEN_REMEDY
     if hot.mean() > MAX_HOT:
         raise CalibrationRefused(f"{hot.mean():.1%} of the pixels shine in the dark (at most {MAX_HOT:.0%})", remedy)

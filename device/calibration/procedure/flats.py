@@ -53,18 +53,18 @@ def measure_flats(levels: Sequence[Moments], bright: Moments, darks: Darks) -> F
     if len(levels) < 3:
         raise CalibrationRefused(f"{len(levels)} levels do not make a line", "Take three flats or more.")
     good = ~darks.hot
-    signals = [one.mean_dn - darks.at(one.exposure_s) for one in levels]
-    white_dn = _saturation_dn(bright, max(levels, key=lambda one: one.exposure_s), good)
-    for one, signal in zip(levels, signals, strict=True):
-        _refuse_level(one, signal, good, white_dn)
-    total: Image = np.sum([signal * one.count for one, signal in zip(levels, signals, strict=True)], axis=0)
+    signals = [level.mean_dn - darks.at(level.exposure_s) for level in levels]
+    white_dn = _saturation_dn(bright, max(levels, key=lambda level: level.exposure_s), good)
+    for level, signal in zip(levels, signals, strict=True):
+        _refuse_level(level, signal, good, white_dn)
+    total: Image = np.sum([signal * level.count for level, signal in zip(levels, signals, strict=True)], axis=0)
     response, shading = flat_field_response(total, good)
     dead = (response < DEAD_PIXEL_RESPONSE) & good
     good &= ~dead
-    times_s = np.array([one.exposure_s for one in levels])
+    times_s = np.array([level.exposure_s for level in levels])
     means = np.array([float(signal[good].mean(dtype=np.float64)) for signal in signals])
     per_s, bend_per_dn = line_through_zero(times_s, means)
-    variances = np.array([float(one.variance_dn2[good].mean(dtype=np.float64)) for one in levels])
+    variances = np.array([float(level.variance_dn2[good].mean(dtype=np.float64)) for level in levels])
     gain = photon_transfer(per_s * times_s, variances, bend_per_dn, darks)
     bend = bend_per_dn * (white_dn - darks.black_dn)
     if abs(bend) > MAX_BEND:
@@ -195,16 +195,17 @@ def _saturation_dn(bright: Moments, longest: Moments, good: Mask) -> float:
     return float(ceil(most - 0.5))
 
 
-def _refuse_level(one: Moments, signal: Image, good: Mask, white_dn: float) -> None:
+def _refuse_level(level: Moments, signal: Image, good: Mask, white_dn: float) -> None:
     """Raise CalibrationRefused if a flat is too dark or saturated."""
     mean_dn = float(np.median(signal[good]))
-    highest_dn = float(np.percentile(one.highest[good], 99))
+    highest_dn = float(np.percentile(level.highest[good], 99))
     if mean_dn < MIN_SHARE * white_dn:
         raise CalibrationRefused(
-            f"the flat of {one.exposure_s:.3g} s is dark: {mean_dn:.0f} DN (at least {MIN_SHARE * white_dn:.0f})",
+            f"the flat of {level.exposure_s:.3g} s is dark: {mean_dn:.0f} DN (at least {MIN_SHARE * white_dn:.0f})",
             "Take the cap off and switch the screen on, then start again.",
         )
     if highest_dn >= SATURATED_SHARE * white_dn:
         raise CalibrationRefused(
-            f"the flat of {one.exposure_s:.3g} s is saturated: {highest_dn:.0f} of {white_dn:.0f} DN", "Dim the screen."
+            f"the flat of {level.exposure_s:.3g} s is saturated: {highest_dn:.0f} of {white_dn:.0f} DN",
+            "Dim the screen.",
         )

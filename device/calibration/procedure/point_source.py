@@ -79,7 +79,7 @@ def measure_point_source(exposures: Sequence[Moments], darks: Darks, flats: Flat
     CalibrationRefused if the source is too dark or too bright, or its light reaches the border.
     """
     bad = darks.hot | flats.dead
-    refuse_level(min(exposures, key=lambda one: one.exposure_s), darks, flats)
+    refuse_level(min(exposures, key=lambda exposure: exposure.exposure_s), darks, flats)
     light = replace_bad_pixels(merge_exposures(exposures, darks, flats) / flats.response, bad)
     light, pedestal, residual, floor = subtract_pedestal(light, bad)
     if disc_px > 0:
@@ -96,10 +96,14 @@ def merge_exposures(exposures: Sequence[Moments], darks: Darks, flats: Flats) ->
     Weights are the exposure times, optimal for shot noise. A pixel saturated in all exposures keeps the shortest one.
     """
     signal, time_s = (np.zeros(darks.map_dn.shape, np.float32) for _ in range(2))
-    for one in sorted(exposures, key=lambda one: one.exposure_s):
-        usable = (one.highest < SATURATED_SHARE * flats.white_dn) | (time_s == 0)
-        lasting_s = np.float32(one.count * one.exposure_s)
-        signal += usable * linearised(one.mean_dn - darks.at(one.exposure_s), flats.bend_per_dn) * np.float32(one.count)
+    for exposure in sorted(exposures, key=lambda exposure: exposure.exposure_s):
+        usable = (exposure.highest < SATURATED_SHARE * flats.white_dn) | (time_s == 0)
+        lasting_s = np.float32(exposure.count * exposure.exposure_s)
+        signal += (
+            usable
+            * linearised(exposure.mean_dn - darks.at(exposure.exposure_s), flats.bend_per_dn)
+            * np.float32(exposure.count)
+        )
         time_s += usable * lasting_s
     return signal / time_s
 

@@ -91,7 +91,7 @@ def choose_split(
     if motion_deg <= MIN_MOTION_DEG:
         return WHOLE
     possible = [_split(count, parts, exposure_s, motion_deg, known) for parts in range(2, MAX_FRAMES // count + 1)]
-    best = max((one for one in possible if one is not None), key=lambda one: one.gain_db, default=WHOLE)
+    best = max((split for split in possible if split is not None), key=lambda split: split.gain_db, default=WHOLE)
     return best if best.gain_db >= MIN_GAIN_DB else WHOLE
 
 

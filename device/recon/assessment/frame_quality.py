@@ -118,7 +118,7 @@ def shows_eye(numbers: Mapping[str, Any]) -> bool:
     Such a frame is evidence about the head. A pupil that cuts the beam lets a part of the diffuser form the image: the
     frame has another PSF and another field than the calibration. Light that is wider than the field is the head's.
     """
-    known = {one.name: float(numbers[one.name]) for one in fields(FrameFigures) if one.name in numbers}
+    known = {figure.name: float(numbers[figure.name]) for figure in fields(FrameFigures) if figure.name in numbers}
     if "wide" in known:
         known["wide"] = min(known["wide"], 1.0)
     seen = FrameFigures(**{"saturated": 0.0} | known)

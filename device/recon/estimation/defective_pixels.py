@@ -51,7 +51,7 @@ HALO = 0.01  # of the light of the fitted field: more is a reflex. Overexposed e
 HALO_BEGINS = 0.05  # of it in the first ring; an eye of 8 dpt with the stored PSF has up to 0.04
 HALO_SD = 3.0  # standard errors of a ring's mean excess
 HALO_MARGIN = 3  # samples beyond the last ring with an excess
-HALO_TURNS = 5  # the halo biases the first fit of the field
+HALO_REPETITIONS = 5  # the halo biases the first fit of the field
 HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
 MIN_AREA = 2  # samples of a saturated area that may have a halo
 RANGE_SHARE = 0.999  # of the PSF's pixels; a frame is a mean of many PSFs, in which no single pixel of one stands out
@@ -327,7 +327,7 @@ class HaloFinder:
         """Return the halo pixels as a mask (rows, cols).
 
         A halo is a set of rings around a masked area in which the light exceeds the fitted smooth illumination plus
-        stray light. Fit and ring test are repeated, without the halos found so far, at most HALO_TURNS times.
+        stray light. Fit and ring test are repeated, without the halos found so far, at most HALO_REPETITIONS times.
         """
         frame = self._prepare(counts, dark, np.flatnonzero(defective))
         lost = frame.good < 0.5
@@ -339,7 +339,7 @@ class HaloFinder:
         ring = np.ceil(distance).astype(np.int64)
         reach = np.zeros(count + 1, np.int64)
         good = frame.good.copy()
-        for _ in range(HALO_TURNS):
+        for _ in range(HALO_REPETITIONS):
             excess, noise = self._excess(replace(frame, good=good, missing=1 - float(good.mean())))
             grown = reach.copy()
             for k in areas:

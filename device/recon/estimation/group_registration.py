@@ -47,10 +47,13 @@ def register_group(
     refined = _refined(registrar, {k: flats[k] for k in used}, near)
     if blurred := _blurred(refined, light):
         reasons |= blurred
-        near = {k: one.shift_px for k, one in refined.items() if k not in blurred}
+        near = {k: registration.shift_px for k, registration in refined.items() if k not in blurred}
         refined = _refined(registrar, {k: flats[k] for k in near}, near)
     first = refined[min(refined)].shift_px
-    shifts = {k: (one.shift_px[0] - first[0], one.shift_px[1] - first[1]) for k, one in refined.items()}
+    shifts = {
+        k: (registration.shift_px[0] - first[0], registration.shift_px[1] - first[1])
+        for k, registration in refined.items()
+    }
     return shifts, reasons
 
 
@@ -63,19 +66,19 @@ def _blurred(found: Mapping[int, Registration], light: Mapping[int, float]) -> d
     """
     if len(found) < FEWEST:
         return {}
-    values = np.clip([one.correlation for one in found.values()], 0.0, 0.999)
+    values = np.clip([registration.correlation for registration in found.values()], 0.0, 0.999)
     typical = float(np.median(values))
     usual = float(np.median([light[k] for k in found]))
-    by_chance = float(np.median([one.sd for one in found.values()])) * (1 - typical**2)
+    by_chance = float(np.median([registration.sd for registration in found.values()])) * (1 - typical**2)
     scatter = max(1.4826 * float(np.median(np.abs(values - typical))), by_chance)  # 1.4826: of a normal distribution
     signal = typical**2 / (1 - typical**2)  # over the noise of the median frame
     reasons = {}
-    for k, one in found.items():
+    for k, registration in found.items():
         power = signal * min(light[k] / usual, 1.0)
         expected = float(np.sqrt(power / (1 + power)))
         least = min(MIN_SHARPNESS * expected, expected - MIN_SCATTER * scatter)
-        if one.correlation < least:
-            reasons[k] = f"is blurred by motion (correlation {one.correlation:.2f}, at least {least:.2f})"
+        if registration.correlation < least:
+            reasons[k] = f"is blurred by motion (correlation {registration.correlation:.2f}, at least {least:.2f})"
     return reasons if len(found) - len(reasons) >= 2 else {}
 
 
@@ -83,8 +86,8 @@ def _pairs(registrar: Registrar, details: dict[int, Detail]) -> dict[tuple[int, 
     """Return the registration of each picture (second index) to each other one (first index)."""
     found = {}
     for i, k in combinations(details, 2):
-        found[i, k] = one = registrar.register(details[i], details[k])
-        found[k, i] = replace(one, shift_px=(-one.shift_px[0], -one.shift_px[1]))
+        found[i, k] = registration = registrar.register(details[i], details[k])
+        found[k, i] = replace(registration, shift_px=(-registration.shift_px[0], -registration.shift_px[1]))
     return found
 
 
@@ -92,8 +95,8 @@ def _least_correlation(found: Sequence[Registration]) -> float:
     """Return the least correlation of a matching frame: above chance, and near the median of the better half."""
     if not found:
         return 0.0
-    sd = float(np.median([one.sd for one in found]))
-    better = sorted(one.correlation for one in found)[len(found) // 2 :]
+    sd = float(np.median([registration.sd for registration in found]))
+    better = sorted(registration.correlation for registration in found)[len(found) // 2 :]
     return max(MIN_SD * sd, MIN_OF_TYPICAL * float(np.median(better)) - 2 * sd)
 
 
@@ -105,7 +108,7 @@ def _refined(registrar: Registrar, flats: Mapping[int, Image], shifts: Mapping[i
     """
     moved = {k: registrar.moved_back(flat, shifts[k]) for k, flat in flats.items()}
     common = np.min([window for _, window in moved.values()], axis=0)
-    details = {k: registrar.windowed(one, common) for k, (one, _) in moved.items()}
+    details = {k: registrar.windowed(image, common) for k, (image, _) in moved.items()}
     refined = {}
     for k, detail in details.items():
         found = registrar.register(registrar.mean([details[i] for i in details if i != k]), detail)

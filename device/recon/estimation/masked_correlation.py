@@ -14,7 +14,8 @@ from scipy import fft, ndimage
 from device.recon.model.field_projection import FieldProjection, Motion, Plane
 from device.values import Image
 
-FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of the smoothing against noise
+FLATTEN_SIGMA_SAMPLES = 10.0  # of the local mean
+SMOOTH_SIGMA_SAMPLES = 1.2  # against noise
 MAX_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
 MIN_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
 SECOND_SAMPLES = 8  # distance from the peak at which another one begins
@@ -55,11 +56,11 @@ class FlatPicture:
 def flatten(picture: Image, field: Image) -> FlatPicture:
     """Return a linear picture (rows, cols) without its shading; `field` (0 to 1) is where it is lit."""
     inside = np.asarray(ndimage.binary_erosion(field > 0.5, iterations=4), np.float32)
-    weight = np.maximum(ndimage.gaussian_filter(inside, FLATTEN_SAMPLES), 0.05)
-    local = ndimage.gaussian_filter(picture * inside, FLATTEN_SAMPLES) / weight
+    weight = np.maximum(ndimage.gaussian_filter(inside, FLATTEN_SIGMA_SAMPLES), 0.05)
+    local = ndimage.gaussian_filter(picture * inside, FLATTEN_SIGMA_SAMPLES) / weight
     level = float((picture * inside).sum() / max(inside.sum(), 1))
     detail = (picture / np.maximum(local, max(0.05 * level, 1e-30)) - 1) * inside
-    detail = np.clip(ndimage.gaussian_filter(detail, SHARPEN_SAMPLES) * inside, -MAX_CONTRAST, MAX_CONTRAST)
+    detail = np.clip(ndimage.gaussian_filter(detail, SMOOTH_SIGMA_SAMPLES) * inside, -MAX_CONTRAST, MAX_CONTRAST)
     return FlatPicture(np.asarray(detail, np.float32), inside)
 
 
@@ -81,7 +82,7 @@ class MaskedCorrelator:
         The peak of a match without shift is that of the inner part of the field, if that is lower: a pattern that
         stands still in the camera is no match.
         """
-        found = max((self._at(picture, angle) for angle in ANGLES_DEG), key=lambda one: one.peak)
+        found = max((self._at(picture, angle) for angle in ANGLES_DEG), key=lambda match: match.peak)
         turn_deg = refined(self._reference, picture, found, self._projection).rotation_deg
         found = self._at(picture, turn_deg)  # with the rotation taken out, peak and shift are those of the whole field
         better = refined(self._reference, picture, found, self._projection)
@@ -96,8 +97,8 @@ class MaskedCorrelator:
         stands still, its middle agrees as well.
         """
         back = turned(picture, -match.rotation_deg)
-        moved = ndimage.shift(back.detail, [-one for one in match.shift], order=1)
-        lit = ndimage.shift(back.field, [-one for one in match.shift], order=1) > 0.99
+        moved = ndimage.shift(back.detail, [-shift for shift in match.shift], order=1)
+        lit = ndimage.shift(back.field, [-shift for shift in match.shift], order=1) > 0.99
         depth = ndimage.distance_transform_edt(np.pad((self._reference.field > 0) & lit, 1))[1:-1, 1:-1]
         inner = depth > OUTER_SHARE * depth.max()
         if not inner.any():
@@ -118,15 +119,15 @@ class MaskedCorrelator:
         """Return the spectra of detail, field and squared detail."""
         detail = picture.detail.astype(np.float64)
         field = picture.field.astype(np.float64)
-        return tuple(fft.rfft2(one, self._shape) for one in (detail, field, detail * detail))
+        return tuple(fft.rfft2(image, self._shape) for image in (detail, field, detail * detail))
 
     def _surface(self, moved: tuple[NDArray[np.complex128], ...], area: float) -> tuple[Floats, Floats]:
         """Return correlation (-1 where the overlap is too small) and overlap for every shift, cyclic."""
         (a, field_a, a2) = self._spectra
         (b, field_b, b2) = moved
 
-        def correlate(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> Floats:
-            return np.asarray(fft.irfft2(np.conj(one) * other, self._shape))
+        def correlate(first: NDArray[np.complex128], other: NDArray[np.complex128]) -> Floats:
+            return np.asarray(fft.irfft2(np.conj(first) * other, self._shape))
 
         count = correlate(field_a, field_b)
         share = count / max(min(self._area, area), 1.0)
@@ -177,7 +178,7 @@ def refined(
         moved: Image = ndimage.map_coordinates(coefficients, at, order=3, prefilter=False)
         down = np.asarray(np.gradient(moved, axis=0))
         right = np.asarray(np.gradient(moved, axis=1))
-        a, b = (_normalised(one[both]) for one in (reference.detail, moved))
+        a, b = (_normalised(image[both]) for image in (reference.detail, moved))
         correlation = float(a @ b)
         if correlation > best.peak or best is start:
             best = replace(best, shift=motion.shift, rotation_deg=motion.rotation_deg, peak=correlation)

@@ -14,7 +14,7 @@ from device.recon.model.forward_model import Model
 from device.values import Image
 
 BINS = 12
-TURNS = 6
+REPETITIONS = 6
 STEPS = 5
 
 
@@ -77,7 +77,7 @@ class PowerLawPrior:
         """
         seen = np.abs(spectrum.ravel()[self.where].astype(np.complex128)) ** 2
         levels = np.empty(BINS)
-        fused_kernels.ring_levels(seen, self.power, self.bins, noise_dn2, TURNS, levels)
+        fused_kernels.ring_levels(seen, self.power, self.bins, noise_dn2, REPETITIONS, levels)
         sound = levels > 1e-4 * levels.max()
         slope = -2.0
         log_power = float(np.log(max(levels.max(), 1e-300)))

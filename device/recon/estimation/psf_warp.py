@@ -90,7 +90,7 @@ class InterpolatedOtf:
         otf = np.empty((rows.size, cols.size), np.complex64) if out is None else out
         scaled = transform * (self.pixels / n)
         row_share, col_share = (dirichlet(f, n).astype(np.float32) for f in (rows, cols))
-        fused_kernels.stretched(self._table, scaled, rows, cols, row_share, col_share, otf)
+        fused_kernels.stretch(self._table, scaled, rows, cols, row_share, col_share, otf)
         return otf
 
     def at_frequencies(self, rows: Series, cols: Series, share: Image, n: int, transform: Transform) -> Spectrum:
@@ -99,7 +99,7 @@ class InterpolatedOtf:
         `share` is the transfer of the sample at these frequencies.
         """
         otf = np.empty(rows.size, np.complex64)
-        fused_kernels.stretched_at(self._table, transform * (self.pixels / n), rows, cols, share, otf)
+        fused_kernels.stretch_at(self._table, transform * (self.pixels / n), rows, cols, share, otf)
         return otf
 
 

@@ -94,7 +94,7 @@ class Registrar:
         """Return a flat picture moved back by `shift_px`, and the window of what it and the reference hold."""
         if shift_px == (0.0, 0.0):
             return flat, self._window
-        back = [-one / self._n for one in shift_px]
+        back = [-shift / self._n for shift in shift_px]
         window = np.minimum(self._window, ndimage.shift(self._window, back, order=1, mode="constant"))
         return ndimage.shift(flat, back, order=3, mode="constant"), window
 
@@ -104,7 +104,7 @@ class Registrar:
 
     def mean(self, details: Sequence[Detail]) -> Detail:
         """Return the mean of details of unit energy."""
-        return Detail(self._unit(np.sum([one.spectrum for one in details], axis=0)))
+        return Detail(self._unit(np.sum([detail.spectrum for detail in details], axis=0)))
 
     def register(self, reference: Detail, moved: Detail) -> Registration:
         """Return the shift of `moved` from `reference`, at most REACH of the shorter side, and their correlation."""

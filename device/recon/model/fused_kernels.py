@@ -1,4 +1,4 @@
-"""Compiled kernels of the iterative solvers and the likelihood fits; each fuses dozens of numpy passes into one."""
+"""Compiled kernels of the iterative solvers and the likelihood fits, each in place of several numpy passes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,17 +150,17 @@ def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> 
 
 @compiled
 def ring_levels(
-    seen: Series, power: Series, ring: NDArray[np.int64], noise_dn2: float, turns: int, levels: Series
+    seen: Series, power: Series, ring: NDArray[np.int64], noise_dn2: float, repetitions: int, levels: Series
 ) -> None:
     """Write the estimated g of each ring in seen = power g + noise_dn2 to `levels`; at least 1e-6 noise_dn2.
-    Least squares, then `turns` reweighted repetitions. `seen` is |Y|^2, `power` |H|^2, `ring` the index of the ring.
+    Least squares, then `repetitions` reweighted ones. `seen` is |Y|^2, `power` |H|^2, `ring` the index of the ring.
     """
     above = np.zeros(levels.size)
     below = np.zeros(levels.size)
-    for turn in range(turns + 1):
+    for repetition in range(repetitions + 1):
         above[:], below[:] = 0, 0
         for k in range(seen.size):
-            w = 1.0 if turn == 0 else 1 / (power[k] * levels[ring[k]] + noise_dn2) ** 2
+            w = 1.0 if repetition == 0 else 1 / (power[k] * levels[ring[k]] + noise_dn2) ** 2
             above[ring[k]] += (seen[k] - noise_dn2) * power[k] * w
             below[ring[k]] += power[k] * power[k] * w
         for b in range(levels.size):
@@ -242,7 +242,7 @@ def _read(table: Spectrum, row: float, col: float) -> complex:
 
 
 @compiled
-def stretched(
+def stretch(
     table: Spectrum, matrix: Series, rows: Series, cols: Series, row_share: Image, col_share: Image, out: Spectrum
 ) -> None:
     """Write the table's values at matrix (col, row), for all pairs of the frequencies `rows` and `cols`, to `out`, each
@@ -258,7 +258,7 @@ def stretched(
 
 
 @compiled
-def stretched_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, share: Image, out: Spectrum) -> None:
+def stretch_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, share: Image, out: Spectrum) -> None:
     """Write the table's values at matrix (col, row), for single frequencies `rows`, `cols`, to `out`, times `share`."""
     for i in range(rows.size):
         down = matrix[1, 0] * cols[i] + matrix[1, 1] * rows[i]
@@ -273,7 +273,7 @@ def negative_log_likelihood(
     ring: NDArray[np.int64],
     s2: float,
     smear: float,
-    turns: int,
+    repetitions: int,
     levels: Series,
     energy: Image,
     power: Image,
@@ -282,7 +282,7 @@ def negative_log_likelihood(
 
     The result is sum(log S + |seen|^2 / S) in nats, NUMERICS.md 7.1. `otf` (H) belongs to the flat indices `where` of
     `seen`, s2 is the noise. q = |H|^2 + smear (its mean over the ring), since a tapered window mixes frequencies.
-    |seen|^2 is written to `energy`, q to `power`, g to `levels`; `turns` is the number of reweighted fits of g.
+    |seen|^2 is written to `energy`, q to `power`, g to `levels`; `repetitions` is the number of reweighted fits of g.
     """
     above = np.zeros(levels.size)
     below = np.zeros(levels.size)
@@ -297,11 +297,11 @@ def negative_log_likelihood(
         below[b] += 1
     for m in range(where.size):
         power[m] += np.float32(smear * above[ring[m]] / below[ring[m]])
-    for turn in range(turns + 1):
+    for repetition in range(repetitions + 1):
         above[:], below[:] = 0, 0
         for m in range(where.size):
             b = ring[m]
-            w = 1.0 if turn == 0 else 1 / (power[m] * levels[b] + s2)
+            w = 1.0 if repetition == 0 else 1 / (power[m] * levels[b] + s2)
             above[b] += (energy[m] - s2) * power[m] * w * w
             below[b] += power[m] * power[m] * w * w
         for b in range(levels.size):
@@ -314,7 +314,7 @@ def negative_log_likelihood(
 
 
 @compiled
-def filtered(spectrum: Spectrum, weight: Image, out: Spectrum) -> None:
+def filter_spectrum(spectrum: Spectrum, weight: Image, out: Spectrum) -> None:
     """Evaluate out = weight * spectrum, for real weights of the frequencies."""
     rows, cols = spectrum.shape
     for i in range(rows):

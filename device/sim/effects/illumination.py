@@ -60,8 +60,8 @@ def light_of_cap(scene: Scene, shape: tuple[int, ...]) -> Image:
     if cap is None:
         return np.ones(shape, np.float32)
     places = ((np.arange(n) - (n - 1) / 2) / scene.geometry.px_per_deg for n in shape)
-    (down, row), (right, col) = (np.unique(np.abs(one), return_inverse=True) for one in places)  # a quadrant
-    light = np.vstack([relative_intensity(cap, magnification, right, one) for one in down])
+    (down, row), (right, col) = (np.unique(np.abs(axis), return_inverse=True) for axis in places)  # a quadrant
+    light = np.vstack([relative_intensity(cap, magnification, right, distance) for distance in down])
     return light[np.ix_(row, col)].astype(np.float32)
 
 

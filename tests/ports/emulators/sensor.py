@@ -99,9 +99,9 @@ class Sensor:
     def _electrons(self, begin_s: float, end_s: float) -> np.ndarray:
         world = self.world
         total = np.array(world.electrons(end_s - begin_s))
-        for glow, lit_s in self.lamp(begin_s, end_s):
-            if glow is not None:
-                total += world.electrons_per_s(glow.colour) * np.float32(glow.level * lit_s)
+        for illumination, lit_s in self.lamp(begin_s, end_s):
+            if illumination is not None:
+                total += world.electrons_per_s(illumination.colour) * np.float32(illumination.level * lit_s)
         return total
 
     def _write(self, counts: np.ndarray, fd: int, stream) -> None:

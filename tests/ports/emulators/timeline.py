@@ -17,8 +17,8 @@ class Timeline:
         return self._changes[-1][1]
 
     @illumination.setter
-    def illumination(self, glow: Illumination | None) -> None:
-        self._changes.append((time.monotonic(), glow))
+    def illumination(self, illumination: Illumination | None) -> None:
+        self._changes.append((time.monotonic(), illumination))
 
     def has_fault(self, part: str) -> bool:
         return part in self.faults
@@ -32,5 +32,8 @@ def segments(
 ) -> list[tuple[Illumination | None, float]]:
     """Return each illumination between two moments with its duration, s."""
     ends = [at_s for at_s, _ in changes[1:]] + [float("inf")]
-    spans = ((glow, min(end, end_s) - max(at_s, begin_s)) for (at_s, glow), end in zip(changes, ends, strict=True))
-    return [(glow, span) for glow, span in spans if span > 0]
+    spans = (
+        (illumination, min(end, end_s) - max(at_s, begin_s))
+        for (at_s, illumination), end in zip(changes, ends, strict=True)
+    )
+    return [(illumination, span) for illumination, span in spans if span > 0]

@@ -42,13 +42,13 @@ def main(lease_s: float, end: str, chip: str) -> None:
     ring = opened(chip, lease_s)
     os.write(1, b"ready\n")
     for turn in itertools.count():
-        for glow, lit_s, dark_s in (
+        for illumination, lit_s, dark_s in (
             (Illumination("red", 0.4), AIM_S, PAUSE_S),
             (Illumination("green"), PICTURE_S, PICTURE_S + MAKE_S),
         ):
-            with ring.on(glow):
+            with ring.on(illumination):
                 time.sleep(lit_s)
-                if turn == ENDS_AT_ROUND and glow.colour == "green":
+                if turn == ENDS_AT_ROUND and illumination.colour == "green":
                     finish(end)
             time.sleep(dark_s)
 

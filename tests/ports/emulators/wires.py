@@ -40,8 +40,8 @@ SINKS = SinkSpec(  # the ring of imx296_power.toml on the second bus, with 60 mA
 class LoggedChain:
     """LEDs on one emulated SPI bus: its messages so far, and what is lit, from the log of the buses."""
 
-    def __init__(self, log: Path, glow: Callable[[dict], Illumination | None]) -> None:
-        self._log, self._glow = log, glow
+    def __init__(self, log: Path, illumination: Callable[[dict], Illumination | None]) -> None:
+        self._log, self._illumination = log, illumination
         self._read, self._seen = 0, []
 
     @property
@@ -60,7 +60,7 @@ class LoggedChain:
 
     def __call__(self, begin_s: float, end_s: float) -> list[tuple[Illumination | None, float]]:
         """Return the illumination between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
-        changes = [(0.0, None)] + [(one["at_s"], self._glow(one["lit"])) for one in self.messages]
+        changes = [(0.0, None)] + [(one["at_s"], self._illumination(one["lit"])) for one in self.messages]
         return segments(changes, begin_s, end_s)
 
 
@@ -75,8 +75,8 @@ class EmulatedBuses(LoggedChain):
             raise RuntimeError("there are no buses here: run these tests by `make test`, or under umockdev-wrapper")
         self.ring = ring
         self.folder = Path(tempfile.mkdtemp(prefix="wires"))
-        super().__init__(self.folder / "spi.jsonl", self._matrix_glow)
-        self.sinks = LoggedChain(self.folder / "sinks.jsonl", sink_glow)
+        super().__init__(self.folder / "spi.jsonl", self._matrix_illumination)
+        self.sinks = LoggedChain(self.folder / "sinks.jsonl", sink_illumination)
         plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
         command = ["/usr/bin/python3", str(SERVE), str(self.folder)]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=plain)
@@ -88,7 +88,7 @@ class EmulatedBuses(LoggedChain):
         """Set the active faults; without arguments, clear them."""
         (self.folder / "faults").write_text("\n".join(faults), encoding="ascii")
 
-    def _matrix_glow(self, lit: dict[str, list[int]]) -> Illumination | None:
+    def _matrix_illumination(self, lit: dict[str, list[int]]) -> Illumination | None:
         sums = [sum(levels[channel] for levels in lit.values()) for channel in range(3)]
         most = max(sums)
         return Illumination(COLOURS[sums.index(most)], min(1.0, most / (FULL * self.ring))) if most else None
@@ -100,7 +100,7 @@ class EmulatedBuses(LoggedChain):
         self._process.stdout.close()
 
 
-def sink_glow(lit: dict[str, float]) -> Illumination | None:
+def sink_illumination(lit: dict[str, float]) -> Illumination | None:
     """Return the colour of SINKS whose outputs sink the most current, and its level."""
     levels = {
         colour: sum(lit.get(str(output), 0.0) for several in leds.outputs for output in several)

@@ -198,7 +198,7 @@ class CropModel:
 
     def _object(self, detail: Spectrum) -> Image:
         """Return the detail of the object (a view) that a whitened spectrum stands for."""
-        fused_kernels.filtered(detail, self._root, self._fft.spectrum)
+        fused_kernels.filter_spectrum(detail, self._root, self._fft.spectrum)
         space = self._fft.inverse()
         space *= self._reach
         return space
@@ -223,7 +223,7 @@ class CropModel:
     def _adjoint(self, frame: Image) -> Spectrum:
         """Return the adjoint of `_blurred`, a new array."""
         adjoint = np.empty_like(self._otf)
-        fused_kernels.filtered(self._adjoint_in_fft(frame), self._root, adjoint)
+        fused_kernels.filter_spectrum(self._adjoint_in_fft(frame), self._root, adjoint)
         return adjoint
 
     def _solve(self, frame: Image, start: Spectrum | None, most: int = MAX_ITERATIONS) -> tuple[Spectrum, Image, Image]:

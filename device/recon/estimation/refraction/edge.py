@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction.field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
-from device.recon.estimation.refraction.likelihood import SMEAR, TURNS, Band, RefractionLikelihood, noise_power
+from device.recon.estimation.refraction.likelihood import REPETITIONS, SMEAR, Band, RefractionLikelihood, noise_power
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.grid import Pair
@@ -173,7 +173,7 @@ class EdgeLikelihood:
             band.ring,
             self._noise_dn2,
             SMEAR,
-            TURNS,
+            REPETITIONS,
             self.levels,
             band.energy,
             band.power,

@@ -28,7 +28,8 @@ SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
 TAPER_UM = 300.0
 FADE_SAMPLES = 2.0  # width of the Gaussian that continues detail into a narrow gap
 WIDE_SAMPLES, RAMP_SAMPLES = 5, 10  # a gap that contains a square of the first width is tapered over the second
-RINGS, TURNS = 20, 4
+RINGS = 20
+REPETITIONS = 4
 SMEAR = 0.1  # of a ring's mean |H|^2: leakage of the tapered window from neighbouring frequencies
 
 
@@ -257,7 +258,7 @@ class RefractionLikelihood:
             part.ring,
             noise_dn2,
             SMEAR,
-            TURNS,
+            REPETITIONS,
             self._levels,
             part.energy,
             part.power,

@@ -52,13 +52,13 @@ class RefractionTask:
     def latest(self) -> Refraction | NoRefraction:
         """Wait for M; return the newest result so far: joined, with cylinder, or M alone, also if that is refused."""
         futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
-        return next((one for one in futures if one.done()), self._found).result()
+        return next((future for future in futures if future.done()), self._found).result()
 
     def best(self) -> Refraction | NoRefraction:
         """Return the last refraction of those that are known; that without a cylinder if there is no other."""
         futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
-        known = (one.result() for one in futures if one.done())
-        return next((one for one in known if isinstance(one, Refraction)), self._found.result())
+        known = (future.result() for future in futures if future.done())
+        return next((result for result in known if isinstance(result, Refraction)), self._found.result())
 
     def whole(self) -> Refraction | NoRefraction:
         """Wait for the refraction, with its cylinder if the task has one, and joined if `join` was called."""
