@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from device.recon.installed_methods import NEEDED
 from device.recon.methods import Method
 from device.recon.model.fft_plans import Planner
 from device.recon.model.forward_model import Model
@@ -88,7 +89,10 @@ def _cases(method: Method) -> Iterator[_Planned]:
         model = method.model(calibration, shape, 1, planner, 0)
         light = model.blur(model.mask)[model.grid.slices] * np.float32(LEVEL_DN)
         light *= 1 + np.float32(NOISE) * rng.standard_normal(model.grid.window, np.float32)
-        yield _Planned(method.build(model, calibration, planner), model, light, method.rounds)
+        solver = method.build(model, calibration, planner)
+        missing = [name for name in NEEDED if not hasattr(solver, name)]
+        _require(not missing, f"its solver has all of the interface Solver, also {' and '.join(missing)}", method)
+        yield _Planned(solver, model, light, method.rounds)
 
 
 def _psf(shape: tuple[int, int], rng: np.random.Generator) -> Image:

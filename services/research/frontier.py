@@ -332,7 +332,7 @@ class _Bench:
             )
             lines = _label(p, self.methods)
             shown.append(Shown(lines, self.moved(_grey(self._reconstruct(recipe).picture))))
-        lines = _label(choice, self.methods)
+        lines = _label(choice, METHODS)  # the instrument chooses among the built-in methods
         shown.append(Shown((lines[0], lines[1], f"{lines[2]}, chosen"), self.chosen))
         return thumbnail_panel(shown, self.case.truth, self.inside, self.case.calibration.simulated)
 
@@ -505,7 +505,9 @@ def _refuse_invalid(request: FrontierRequest) -> None:
         )
     if request.repeats < 1:
         raise SettingError(f"{request.repeats} repeats measure nothing", "Give --repeats of at least 5.")
-    for place in (request.json, request.plot):
+    for place, kind in ((request.json, ".json"), (request.plot, ".svg")):
+        if place.suffix.lower() != kind:
+            raise SettingError(f"{place} would hold another kind of file than it says", f"Choose a name in {kind}.")
         require_writable(place)
 
 

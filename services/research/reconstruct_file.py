@@ -315,11 +315,14 @@ def file_report(report: Report, solver: Reconstructor, options: ReconstructOptio
 
 
 def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tuple[str, ...]:
-    """Return what to doubt: a closed form without a known field, a residual that neither noise nor `notes` explain."""
+    """Return what to doubt: a method that was given no field, a residual that neither noise nor `notes` explain."""
     found = []
-    if solver.stages[_place_of(solver, report)].is_closed_form and not np.isfinite(field_radius_px(solver.calibration)):
+    is_plugin = report.method not in METHODS
+    is_closed_form = solver.stages[_place_of(solver, report)].is_closed_form
+    if (is_closed_form or is_plugin) and not np.isfinite(field_radius_px(solver.calibration)):
+        kind = "plug-in" if is_plugin else "closed form"
         found.append(
-            f"No field is known, and the closed form '{report.method}' takes the whole frame as lit. Where only a disc "
+            f"No field is known, and the {kind} '{report.method}' takes the whole frame as lit. Where only a disc "
             "is lit, give the head (--head), or use the method 'open'."
         )
     residual = report.residual or 0.0

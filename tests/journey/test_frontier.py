@@ -109,7 +109,7 @@ def test_files_give_the_same_scores_as_a_scene(diffuscope: Run, tiny: Path, tmp_
     assert diffuscope("simulate", tiny, "-o", tmp_path).returncode == 0
     files = ("--raw", tmp_path / "raw.tiff", "--psf", tmp_path / "psf.tiff", "--truth", tmp_path / "truth.npy")
     out = ("--json", tmp_path / "f.json", "--plot", tmp_path / "f.svg", "--repeats", 1)
-    done = diffuscope("frontier", *files, "--head", tiny, *out)
+    done = diffuscope("frontier", *files, "--head", tiny, *out, "--method", "tikhonov")  # not the one that it chooses
     assert done.returncode == 0, done.stderr
     facts = json.loads((tmp_path / "f.json").read_text())
     assert facts["region"]["shift_px"] == [0, 0]
@@ -130,6 +130,7 @@ def test_files_give_the_same_scores_as_a_scene(diffuscope: Run, tiny: Path, tmp_
         (("--scene", DIABETIC, "--budget-s", "0"), "is not a time"),
         (("--scene", "none.toml"), "none.toml"),
         (("--scene", DIABETIC, "--plot", "nowhere/f.svg"), "a folder that does not exist"),
+        (("--scene", DIABETIC, "--plot", "f.png"), "Choose a name in .svg"),
     ],
 )
 def test_impossible_measurement_is_refused(

@@ -140,6 +140,9 @@ def test_a_closed_form_without_a_field_warns(scene: diffuscope.SimulatedScene) -
     for method in ("tikhonov", "gradient", "evidence"):
         notes = diffuscope.reconstruct(scene.raw, scene.psf, method=method).report.warnings
         assert f"the closed form '{method}' takes the whole frame as lit" in notes[0]
+    own = resources.ROOT / "services" / "research" / "site" / "gallery" / "own_solver.py"
+    notes = diffuscope.reconstruct(scene.raw, scene.psf, method=f"{own}:METHOD").report.warnings
+    assert "the plug-in 'fista' takes the whole frame as lit" in notes[0]
     assert not diffuscope.reconstruct(scene.raw, scene.psf, method="open").report.warnings
     with_field = diffuscope.reconstruct(scene.raw, scene.psf, head=scene, method="gradient", refraction=False)
     assert not with_field.report.warnings

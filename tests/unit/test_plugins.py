@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,12 @@ def test_built_in_methods_fulfil_the_contract(name: str) -> None:
 @pytest.mark.usefixtures("own_solver")
 def test_the_example_fulfils_the_contract() -> None:
     check_method(find_method("fista"))
+
+
+def test_a_solver_that_lacks_a_part_of_the_interface_breaks_the_contract_by_its_name() -> None:
+    method = replace(METHODS["tikhonov"], build=lambda *_: SimpleNamespace(start=print))
+    with pytest.raises(AssertionError, match=r"tikhonov: its solver has all .* also .*step"):
+        check_method(method)
 
 
 @pytest.mark.usefixtures("own_solver")
