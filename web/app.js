@@ -1,27 +1,26 @@
 // Controller of the exam page: handles route changes and server events, and renders the state store. User actions are
 // in core/actions.js.
 
-import { actions, pageHooks } from "./core/actions.js";
-import { requestControl, EventStream, getCapture, getProtocol, getStatus, releaseControl, ApiError } from "./core/api.js";
+import { actions } from "./core/actions.js";
+import { showAim } from "./core/aiming.js";
+import { EventStream, getCapture, getProtocol, releaseControl } from "./core/api.js";
 import { page } from "./screens/page_layout.js";
 import { bindKeys } from "./core/keyboard.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
-import { playCue, resetPictureTools, captureEventHandlers, openPicture, rejectForeignCapture, resolveCutShots, takePicture } from "./core/capture.js";
+import { resetPictureTools, captureEventHandlers, openPicture, rejectForeignCapture } from "./core/capture.js";
 import { buttonsChanged } from "./core/taps.js";
 import { startRouter, navigate } from "./core/router.js";
-import { lowerAlerts, endNotice, raiseAlert, syncNotices } from "./core/alerts.js";
+import { lowerAlert, lowerAlerts, endNotice, raiseAlert } from "./core/alerts.js";
+import { refreshStatus, renewControl } from "./core/status.js";
 import { render } from "./vendor/lit-html.js";
 import { finishWhenComplete, alertOnError, refreshHome, refreshList, refreshMontages, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
-import { loadLanguage, t, today } from "./i18n/translate.js";
+import { loadLanguage, today } from "./i18n/translate.js";
 
 /** @typedef {import("./core/state.js").State} State */
 
 const STATUS_BEATS = 10; // request the status at every tenth heartbeat
 const LEASE_BEATS = 4; // renewal period; the server's control lease lasts ten seconds
-const PROMPT_MIN_MS = 700; // minimum display time of a prompt
-const AUTO_CAPTURE_MS = 500;
-const LATE_S = 4; // the server answers within 2 s, with a frame or without one
 
 const $ = (selector) => document.querySelector(selector);
 
@@ -34,12 +33,12 @@ async function showRoute(route) {
   if (!same) resetPictureTools();
   // Alerts of a failed action are cleared when the screen changes.
   if (!same) lowerAlerts(({ from }) => from === "press");
-  if (route.visit !== before.visit) lowerAlerts("shot.crossed");
+  if (route.visit !== before.visit) lowerAlert("shot.crossed");
   if (route.screen !== "outcome") set({ finishing: null });
-  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, code: undefined });
+  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, qrCode: null });
   buttonsChanged();
-  lowerAlerts("link.slow");
-  if (route.screen !== "film" || route.visit !== before.visit) set({ montages: Object.freeze({}) });
+  lowerAlert("link.slow");
+  if (route.screen !== "pictures" || route.visit !== before.visit) set({ montages: Object.freeze({}) });
   if (!same) set({ visits: null, folders: null, copied: null, zipped: false, blink: false });
   renewControl();
   await loadRoute(route);
@@ -50,6 +49,7 @@ async function showRoute(route) {
 // again.
 const LAZY_MODULES = {
   history: () => import("./screens/history.js"),
+  pictures: () => import("./screens/pictures.js"),
   send: () => import("./screens/send.js"),
   speech: () => import("./components/speech_dialog.js"),
   details: () => import("./components/picture_details.js"),
@@ -57,13 +57,13 @@ const LAZY_MODULES = {
 };
 const MODULES_OF_SCREEN = {
   find: ["viewer"],
-  person: ["viewer", "speech"],
+  patient: ["viewer", "speech"],
   aim: ["viewer", "speech"],
   picture: ["viewer", "details"],
-  history: ["viewer", "history"],
+  history: ["viewer", "history", "pictures"],
   send: ["send"],
-  film: ["viewer", "history"],
-  compare: ["viewer", "history"],
+  pictures: ["viewer", "pictures"],
+  compare: ["viewer", "pictures"],
 };
 
 async function loadModule(name) {
@@ -87,10 +87,10 @@ async function loadRoute(route) {
   const visit = await refreshVisit(route.visit);
   if (get().route.visit !== route.visit) return;
   if (!visit && !get().visit && get().link !== "lost") return leaveVisit();
-  if (visit?.finished_at && ["aim", "person"].includes(route.screen)) {
+  if (visit?.finished_at && ["aim", "patient"].includes(route.screen)) {
     return navigate({ screen: "outcome", visit: route.visit }, { replace: true }); // a finished visit is read-only
   }
-  if (route.screen === "film") refreshMontages(route.visit);
+  if (route.screen === "pictures") refreshMontages(route.visit);
   if (route.screen === "compare") {
     const captures = await Promise.all([route.capture, route.other].map((id) => alertOnError(() => getCapture(id))));
     const found = captures.filter((one) => one !== undefined);
@@ -117,20 +117,17 @@ const focusScreen = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScro
 
 // ---- server events
 
-let heartbeats = 0;
-
 const eventHandlers = {
   ...captureEventHandlers,
 
   link(link) {
     set({ link });
     if (link === "lost") raiseAlert({ code: "link.lost", from: "page" });
-    else lowerAlerts("link.lost");
+    else lowerAlert("link.lost");
     if (link === "live") refresh();
   },
 
-  beat() {
-    heartbeats += 1;
+  beat(data, heartbeats) {
     // While a status alert is shown, poll at every heartbeat, so that the alert ends soon after its cause.
     if (heartbeats % STATUS_BEATS === 0 || get().alerts.some(({ from }) => from === "status")) refreshStatus();
     else if (get().route.screen === "send" && heartbeats % LEASE_BEATS === 1) refreshOutbox();
@@ -138,11 +135,11 @@ const eventHandlers = {
   },
 
   state: ({ state }) => set({ activity: state }),
-  aim: (aim) => showAim(aim),
+  aim: showAim,
 
   /** An advisory alert begins, changes (`n`) or ends. */
   notice({ code, over: gone, ...more }) {
-    noticeCount += 1;
+    set({ noticeCount: get().noticeCount + 1 });
     if (code === "link.other") renewControl(); // the lease answer shows whether this page holds control
     else if (gone) endNotice(code);
     else raiseAlert({ code, ...more, from: "notice" });
@@ -154,86 +151,6 @@ const eventHandlers = {
   },
 };
 
-// The age on the live picture already shows a cut light; the next frame follows. And `light.visit` refuses light
-// without a visit only, while every picture of this page has one.
-const UNSHOWN_PROBLEMS = ["light.cut", "light.visit"];
-
-let interruptedShown = false;
-
-let noticeCount = 0;
-
-async function refreshStatus() {
-  const before = noticeCount;
-  let status;
-  try {
-    status = await getStatus();
-  } catch (problem) {
-    if (!(problem instanceof ApiError)) throw problem;
-    return; // the event stream already shows the lost connection
-  }
-  const { problem } = status;
-  set({ status: Object.freeze(status), activity: status.state });
-  lowerAlerts(({ from, problemCode }) => from === "status" && problemCode !== problem?.code);
-  if (problem && !UNSHOWN_PROBLEMS.includes(problem.code)) raiseAlert({ ...problem, problemCode: problem.code, from: "status" });
-  if (noticeCount === before) syncNotices(status.standing ?? []); // otherwise `status.standing` is older than the latest notice event
-  resolveCutShots();
-  raiseFindings(status.notices ?? []);
-  if (status.swept?.length && !interruptedShown) raiseInterrupted(status.swept);
-  await renewControl();
-}
-
-const shownFindings = new Set(); // dismissed findings are not shown again on this page
-
-// Show findings of the instrument's self-checks that do not block captures, with the server's text.
-function raiseFindings(notices) {
-  lowerAlerts(({ from, message }) => from === "finding" && !notices.includes(message));
-  for (const message of notices.filter((text) => !shownFindings.has(text))) {
-    shownFindings.add(message);
-    raiseAlert({ code: `finding.${shownFindings.size}`, level: "tell", rank: 99, message, buttons: ["later"], from: "finding" });
-  }
-}
-
-function raiseInterrupted(swept) {
-  interruptedShown = true;
-  const [first] = swept;
-  const known = swept.length === 1 && first.slot ? first : { buttons: ["ok"] };
-  raiseAlert({ code: "power.lost", message: t("swept", { n: swept.length }), ...known, from: "page" });
-}
-
-// Screens that show what was taken. A page on one of them never takes the camera, and releases it.
-const READING = ["outcome", "film", "compare", "history", "send"];
-
-/**
- * Return whether this page needs the control lease: it aims, or a picture of its own is being taken.
- * @param {State} state
- */
-const needsControl = ({ route, shots }) => route.screen === "aim" || shots.some((shot) => !shot.over && !shot.reloaded);
-
-/** @param {State} state */
-const isReading = ({ route, visit }) => READING.includes(route.screen) || (route.screen === "picture" && Boolean(visit?.finished_at));
-
-// Request or renew the control lease where this page needs it; between two pictures renew it where it is held.
-async function renewControl() {
-  if (!needsControl(get()) && (isReading(get()) || !get().hasControl)) {
-    if (get().hasControl) releaseControl();
-    set({ hasControl: false });
-    return lowerAlerts(({ code, from }) => code === "link.other" && from === "page");
-  }
-  try {
-    setControl(await requestControl(false));
-  } catch (problem) {
-    if (!(problem instanceof ApiError)) throw problem;
-  }
-}
-
-function setControl({ mine }) {
-  set({ hasControl: mine });
-  if (mine) lowerAlerts("link.other");
-  else if (needsControl(get())) raiseAlert({ code: "link.other", from: "page" });
-}
-
-Object.assign(pageHooks, { refreshStatus, setControl });
-
 async function refresh() {
   await refreshStatus();
   if (!get().protocol) set({ protocol: (await alertOnError(getProtocol)) ?? null });
@@ -241,43 +158,9 @@ async function refresh() {
   await loadRoute(get().route);
 }
 
-// ---- aiming: at most one new prompt every 0.7 s
-
-let promptedMs = 0;
-let readySinceMs = 0;
-
-function showAim(aim) {
-  if (!aim || get().route.screen !== "aim") return;
-  const now = performance.now();
-  const was = get().prompt;
-  if (aim.code !== "ready") readySinceMs = 0;
-  else readySinceMs ||= now;
-  if (aim.code !== was?.code && now - promptedMs >= PROMPT_MIN_MS) {
-    promptedMs = now;
-    set({ prompt: Object.freeze(aim) });
-    if (aim.code === "ready") playCue("ready");
-  }
-  if (get().auto && get().prompt?.code === "ready" && readySinceMs && now - readySinceMs > AUTO_CAPTURE_MS) takePicture();
-}
-
 // Release the control lease when the page closes, so that another screen can take pictures. After a reload, this page
 // requests control again.
 addEventListener("pagehide", releaseControl);
-
-Object.assign(actions, {
-  previewAim: ({ detail }) => showAim(detail),
-  // Consent or control changed on another screen: reload the visit or the lease to show the reason.
-  previewRefused({ detail: { code } }) {
-    if (code.startsWith("consent.")) refreshVisit(get().route.visit);
-    else if (code === "link.other") renewControl();
-  },
-  previewLate({ detail: { frame_s, link_s } }) {
-    if (frame_s && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
-    if (link_s >= LATE_S && get().link === "live") {
-      raiseAlert({ code: "link.slow", n: frame_s, from: "page" });
-    } else lowerAlerts("link.slow");
-  },
-});
 
 // ---- render
 

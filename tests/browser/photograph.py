@@ -33,7 +33,7 @@ class Camera:
         if ready:
             self.page.wait_for_selector(ready)
             self.page.wait_for_timeout(500)
-        if name not in ("person-urgent", "slip"):
+        if name not in ("patient-urgent", "slip"):
             self.page.evaluate("scrollTo(0, 0)")
         self._count += 1
         self.page.screenshot(path=self.folder / f"{self._count:02d}-{name}.png")
@@ -59,10 +59,10 @@ def photograph(page: Page, real: Real, standing: StandingAlerts, folder: Path) -
     page.locator("[data-key='9']").tap()
     page.locator(".people").wait_for(state="detached")
     camera.take("find-no-match", "#start:not([hidden])")
-    at(f"visit/{visit}/person", ".person", "person")
+    at(f"visit/{visit}/patient", ".patient", "patient")
     page.locator("[data-field=complaints] [data-value=pain]").tap()
     page.locator(".urgent").scroll_into_view_if_needed()
-    camera.take("person-urgent")
+    camera.take("patient-urgent")
     page.locator("[data-field=complaints] [data-value=pain]").tap()
     for code in standing.CODES:
         standing.open(page, code)
@@ -155,18 +155,18 @@ def after(camera: Camera, real: Real, visit: str, at: Callable[[str, str, str], 
     camera.take("slip")
     page.emulate_media(media="screen")
     declined = real.begin_visit(consent="declined")["id"]
-    at(f"visit/{declined}/person", ".person", "declined")
+    at(f"visit/{declined}/patient", ".patient", "declined")
     camera.tap("#finish")
     camera.take("outcome-refer", ".outcome")
     real.begin_visit(consent="agreed", sex="man", age=61)
     at("", "#continue", "home")
     at("history", ".history [data-visit]", "history")
     real.mount()
-    at(f"visit/{visit}/film", ".film li", "film")
+    at(f"visit/{visit}/pictures", ".pictures li", "pictures")
     for pick in page.locator(".pick").all()[:2]:
         pick.tap()
     camera.tap("#copy")
-    camera.take("film-picked", "[data-folder]")
+    camera.take("pictures-picked", "[data-folder]")
     camera.tap("#compare")
     camera.take("compare", ".two figure:last-child [data-mark=final]")
     page.locator("[data-value=true]").tap()

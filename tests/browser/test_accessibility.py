@@ -95,7 +95,7 @@ def test_magnified_page_scrolls_in_one_direction(open_page: Open, real: Real, si
     faults = {"home": look_for_faults(page)}
     tap(page, "#new")
     page.wait_for_selector("#say")
-    faults["person"] = look_for_faults(page)
+    faults["patient"] = look_for_faults(page)
     tap(page, "[data-value=agreed]")
     tap(page, "#shoot")
     wait_for_preview(page)

@@ -228,7 +228,7 @@ def test_every_alert_fits_in_longest_texts(
     real.hold = None
     page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
     faults["again"] = look_for_faults(page, "#again", "#keep")
-    for place in ("person", "film", "outcome"):
+    for place in ("patient", "pictures", "outcome"):
         page.goto(f"{real.url}/#/visit/{visit['id']}/{place}")
         page.wait_for_selector(f".{place}")
         faults[place] = look_for_faults(page)

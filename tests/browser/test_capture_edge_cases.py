@@ -231,7 +231,7 @@ def test_finished_visit_is_read_only_until_reopened(open_page: Open, real: Real,
     assert look_for_faults(page, "#result") == []
     after_debounce(page).keyboard.press("r")
     expect(page.locator("#done")).to_be_visible()
-    for there in ("aim/R-nerve", "person"):
+    for there in ("aim/R-nerve", "patient"):
         page.goto(f"{real.url}/#/visit/{visit_of(page)}/{there}")
         expect(page.locator("#done")).to_be_visible()
     assert real.presses == 1
@@ -246,8 +246,8 @@ def test_visit_of_earlier_day_cannot_be_reopened(open_page: Open, real: Real) ->
     page.reload()
     page.wait_for_selector("#done")
     expect(page.locator("#reopen")).to_have_count(0)
-    page.goto(f"{real.url}/#/visit/{visit_of(page)}/film")
-    page.wait_for_selector(".film li")
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/pictures")
+    page.wait_for_selector(".pictures li")
     expect(page.locator("#reopen")).to_have_count(0)
 
 

@@ -192,7 +192,7 @@ def test_markup_in_form_fields_is_stored_as_text(open_page: Open, real: Real, co
     fields = page.evaluate(f"fetch('/api/visits/{visit}').then((answer) => answer.json())")["fields"]
     assert fields["name"] in HOSTILE
     assert fields["consent"] == "agreed"
-    for screen in (f"visit/{visit}/person", f"visit/{visit}/film", "find", "history"):
+    for screen in (f"visit/{visit}/patient", f"visit/{visit}/pictures", "find", "history"):
         page.goto(f"{real.url}/#/{screen}")
         page.wait_for_selector(f"[data-screen={screen.split('/')[-1]}]")
         assert page.locator("img[src=x]").count() == 0

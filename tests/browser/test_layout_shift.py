@@ -67,9 +67,9 @@ def test_a_message_moves_no_button(open_page: Open, real: Real, size: tuple[int,
     expect(page.locator("#result-title")).to_have_text("Good")
     expect(page.locator("[data-code='make.slow']")).to_have_count(0)  # the card says that the worker can go on
     assert_still(("heat.warm", "batt.empty"), "[data-slot='R-centre']", "#again", "#next", "#finish")
-    page.goto(f"{real.url}/#/visit/{visit_of(page)}/person")
-    page.wait_for_selector(".person .asking")
-    assert_still(("heat.warm", "batt.empty"), "[data-value=agreed]", "#shoot", "#film")
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/patient")
+    page.wait_for_selector(".patient .asking")
+    assert_still(("heat.warm", "batt.empty"), "[data-value=agreed]", "#shoot", "#pictures")
     page.goto(real.url)
     page.wait_for_selector("#continue")
     assert_still(("heat.warm", "batt.empty"), "#new", "#continue", "#find")
@@ -96,7 +96,7 @@ def test_previous_picture_is_kept_and_back_leads_home(open_page: Open, real: Rea
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     assert real.presses == 2
     tap(page, "#back")
-    page.wait_for_selector("[data-screen=person]")
+    page.wait_for_selector("[data-screen=patient]")
     tap(page, "#back")
     page.wait_for_selector("#new")
 
@@ -158,7 +158,7 @@ def test_number_with_check_digit_is_found_in_both_forms(open_page: Open, real: R
 
 def test_no_layout_shift_from_form_input(open_page: Open, real: Real) -> None:
     visit = real.begin_visit()
-    page = open_page(f"{real.url}/#/visit/{visit['id']}/person", SIZES["portrait"])
+    page = open_page(f"{real.url}/#/visit/{visit['id']}/patient", SIZES["portrait"])
     page.wait_for_selector(".asking")
     chips = [f"[data-value={value}]" for value in ("agreed", "declined", "woman", "man", "flashes", "red")]
     before = boxes(page, *chips, ".question .pad", "[data-field=diabetes]")

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.browser
 NO_PLACE = {"shift_px": None, "rotation_deg": None, "peak": None, "overlap": None, "reason": None}
 
 
-def film(open_page: Open, real: Real, state: list[str], used: int = 0, pictures: int = 2) -> Page:
+def pictures_screen(open_page: Open, real: Real, state: list[str], used: int = 0, pictures: int = 2) -> Page:
     """Open the pictures of a visit whose montage of the right eye has the last one of the states."""
     visit = real.begin_visit(consent="agreed")["id"]
     real.press(visit, "L-centre")
@@ -35,13 +35,13 @@ def film(open_page: Open, real: Real, state: list[str], used: int = 0, pictures:
     page.route("**/montage/OD", answer)
     png = to_png(gaze(WIDE_RETINA, (0, 0)), True)
     page.route("**/montage/OD/picture.png?*", lambda route: route.fulfill(body=png, content_type="image/png"))
-    page.goto(f"{real.url}/#/visit/{visit}/film")
+    page.goto(f"{real.url}/#/visit/{visit}/pictures")
     return page
 
 
 def test_joined_pictures_are_shown_once_they_are_known(open_page: Open, real: Real) -> None:
     state = ["computing"]
-    page = film(open_page, real, state, used=2, pictures=3)
+    page = pictures_screen(open_page, real, state, used=2, pictures=3)
     right, left = page.locator(".montage[data-eye=OD]"), page.locator(".montage[data-eye=OS]")
     expect(left).to_contain_text("One picture: there is nothing to join.")  # the answer of the server
     expect(left.locator("eye-pic")).to_have_count(0)
@@ -63,6 +63,6 @@ def test_joined_pictures_are_shown_once_they_are_known(open_page: Open, real: Re
     [("apart", "Not joined: the pictures show different parts of the eye."), ("failed", "could not be joined")],
 )
 def test_without_a_montage_there_is_the_reason(open_page: Open, real: Real, state: str, words: str) -> None:
-    page = film(open_page, real, [state])
+    page = pictures_screen(open_page, real, [state])
     expect(page.locator(".montage[data-eye=OD]")).to_contain_text(words)
     expect(page.locator(".montage eye-pic")).to_have_count(0)

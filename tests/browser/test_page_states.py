@@ -185,7 +185,7 @@ def test_first_tap_of_a_page_counts(open_page: Open, real: Real) -> None:
         }).observe(document.querySelector("#app"), { childList: true, subtree: true }));
     """)
     page.goto(real.url)
-    page.wait_for_selector(".person")
+    page.wait_for_selector(".patient")
     page.wait_for_timeout(300)
     assert len(real.visits()) == 1
 
@@ -193,7 +193,7 @@ def test_first_tap_of_a_page_counts(open_page: Open, real: Real) -> None:
 def test_double_tap_on_new_patient_begins_one_visit(open_page: Open, real: Real) -> None:
     page = after_debounce(open_page(real.url))
     page.locator("#new").dblclick()
-    page.wait_for_selector(".person")
+    page.wait_for_selector(".patient")
     page.wait_for_timeout(300)
     assert len(real.visits()) == 1
 

@@ -49,7 +49,7 @@ def test_home_links_to_upload_queue(open_page: Open, queue: Queue) -> None:
     tap(page, "#try-now")
     expect(page.locator(".send [aria-live]")).to_contain_text("sent when no patient is being examined")
     after_debounce(page).locator(f"[data-visit='{queue.visits[0]}']").tap()
-    page.wait_for_selector(".film")
+    page.wait_for_selector(".pictures")
     tap(page, "#back")
     page.wait_for_selector(".send .people li")
     page.reload()

@@ -61,7 +61,7 @@ def voices_page(open_page: Open, real: Real) -> Page:
     page = open_page("about:blank")
     page.context.add_init_script(path=VOICES)
     visit = real.begin_visit()
-    page.goto(f"{real.url}/#/visit/{visit['id']}/person")
+    page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     page.wait_for_selector("#say")
     return page
 
@@ -142,7 +142,7 @@ def test_failed_or_stalled_voice_shows_large_text(open_page: Open, real: Real, v
     page.context.add_init_script(path=VOICES)
     page.context.add_init_script(f"window.voices = ['{voice}']")
     visit = real.begin_visit()
-    page.goto(f"{real.url}/#/visit/{visit['id']}/person")
+    page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     page.locator("#say").tap()
     expect(page.locator("dialog[open] .warning")).to_have_text("The voice did not work. Please read it out.")
     expect(page.locator("#sentence")).to_have_text(sentences("en")["say.consent"])
@@ -153,7 +153,7 @@ def test_tones_and_vibrations_of_capture_events(open_page: Open, real: Real) -> 
     page = open_page("about:blank")
     page.context.add_init_script(LISTEN)
     visit = real.begin_visit(consent="agreed")
-    page.goto(f"{real.url}/#/visit/{visit['id']}/person")
+    page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     tap(page, "#shoot")
     wait_for_preview(page)
     expect(page.locator(".prompt")).to_contain_text("No eye seen")

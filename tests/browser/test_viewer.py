@@ -276,10 +276,10 @@ def test_viewers_share_one_context_and_release_it(open_page: Open, real: Real) -
         wait_until_drawn(page, "red-free 0 1", f".two eye-pic >> nth={i}")
     for pic in page.locator(".two eye-pic").all():
         assert pixel(pic)[0] == pixel(pic)[2] > 40
-    page.goto(f"{real.url}/#/visit/{visit_of(page)}/film")
-    page.wait_for_selector(".film img >> nth=1")
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/pictures")
+    page.wait_for_selector(".pictures img >> nth=1")
     assert page.evaluate(wide) == 1
-    assert page.locator(".film canvas").count() == 0, "thumbnails are plain pictures"
+    assert page.locator(".pictures canvas").count() == 0, "thumbnails are plain pictures"
 
 
 def test_interpolation_depends_on_scale(bench: Page) -> None:
@@ -466,9 +466,9 @@ def test_a_visit_with_one_picture_without_colour_is_shown_in_green_and_says_why(
     wait_until_drawn(page, "colour 0 0")
     red, green, blue = pixel(page.locator("#picture"))
     assert red == green == blue, "the first picture follows its visit"
-    page.goto(f"{real.url}/#/visit/{visit_of(page)}/film")
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/pictures")
     expect(page.locator("#green")).to_have_text(why)
-    thumbnail = page.locator(".film .thumb img").first
+    thumbnail = page.locator(".pictures .thumb img").first
     expect(thumbnail).to_have_js_property("complete", True)
     assert thumbnail.evaluate(GREYNESS) < 2
 
@@ -557,5 +557,5 @@ def test_comparison_is_reloaded_and_refuses_another_visit(open_page: Open, real:
     page.reload()
     expect(page.locator(".compare figcaption").first).to_contain_text("Right eye · Centre")
     page.goto(f"{real.url}/#/visit/{visit}/compare/{first}/{second}")
-    page.wait_for_selector("[data-screen=person]")
+    page.wait_for_selector("[data-screen=patient]")
     expect(page.locator(".state-bar")).to_contain_text("This picture is of another person.")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zxingcpp
 from PIL import Image
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from services.records.protocol import load_protocol
 from tests.browser.conftest import Complaints, MakeReal
@@ -152,7 +152,7 @@ def test_new_patient_needs_three_taps_and_no_typing(open_page: Open, real: Real)
 
 def test_urgent_complaint_shows_warning(open_page: Open, real: Real) -> None:
     visit = real.begin_visit()["id"]
-    page = open_page(f"{real.url}/#/visit/{visit}/person")
+    page = open_page(f"{real.url}/#/visit/{visit}/patient")
     page.locator("[data-value=sudden_loss]").tap()
     expect(page.locator(".urgent")).to_have_text("See the doctor today.")
 
@@ -190,10 +190,30 @@ def test_finish_asks_when_a_picture_is_missing(open_page: Open, real: Real) -> N
     assert real.visit()["finished_at"] is not None
 
 
+def test_a_refused_field_is_shown_with_the_number_that_the_server_sent(
+    open_page: Open, real: Real, complaints: Complaints
+) -> None:
+    complaints.expect("423")
+    visit = real.begin_visit()["id"]
+    page = after_debounce(open_page(f"{real.url}/#/visit/{visit}/patient"))
+    refusal = {"code": "light.limit", "message": "the limit of light is reached", "n": 4}
+
+    def refuse(route: Route) -> None:
+        if route.request.method == "PATCH":
+            route.fulfill(status=423, json=refusal)
+        else:
+            route.fallback()
+
+    page.route(f"**/api/visits/{visit}", refuse)
+    page.locator("[data-value=man]").tap()
+    expect(page.locator(".state-bar")).to_contain_text("Rest it 4 minutes.")
+    expect(page.locator("[data-value=man]")).to_have_attribute("aria-pressed", "false")
+
+
 def test_unsaved_fields_are_resent_after_reconnection(open_page: Open, real: Real, complaints: Complaints) -> None:
     complaints.expect("ERR_INTERNET_DISCONNECTED", "ERR_FAILED")
     visit = real.begin_visit()["id"]
-    page = after_debounce(open_page(f"{real.url}/#/visit/{visit}/person"))
+    page = after_debounce(open_page(f"{real.url}/#/visit/{visit}/patient"))
     page.route(f"**/api/visits/{visit}", lambda route: route.abort())
     page.locator("[data-value=man]").tap()
     expect(page.locator("#unsaved")).to_be_visible()
@@ -307,8 +327,8 @@ def test_reload_restores_every_screen(open_page: Open, real: Real) -> None:
     reloaded("find", ".pad")
     tap(page, "#back")
     tap(page, "#new")
-    page.wait_for_selector(".person")
-    reloaded("person", "[data-value=agreed]")
+    page.wait_for_selector(".patient")
+    reloaded("patient", "[data-value=agreed]")
     tap(page, "[data-value=agreed]")
     tap(page, "#shoot")
     wait_for_preview(page)
@@ -323,8 +343,8 @@ def test_reload_restores_every_screen(open_page: Open, real: Real) -> None:
     tap(page, "#history")
     reloaded("history", "[data-visit]")
     tap(page, "[data-visit]")
-    page.wait_for_selector(".film li")
-    reloaded("film", ".film li")
+    page.wait_for_selector(".pictures li")
+    reloaded("pictures", ".pictures li")
 
 
 def test_reload_during_capture_waits_for_result(open_page: Open, real: Real) -> None:
@@ -348,9 +368,9 @@ def test_back_is_one_step(open_page: Open, real: Real) -> None:
         page.go_back()
         page.wait_for_timeout(100)
         steps.append(screen(page))
-    assert steps == ["aim", "person", "home"]
+    assert steps == ["aim", "patient", "home"]
     page.go_forward()
-    page.wait_for_selector(".person")
+    page.wait_for_selector(".patient")
     tap(page, "#back")
     page.wait_for_selector("#new")
 
@@ -366,7 +386,7 @@ def test_find_by_number_and_compare_two_pictures(open_page: Open, real: Real) ->
         page.locator(f"[data-key='{key}']").tap()
     tap(page, "[data-visit]")
     page.wait_for_selector("[data-screen=aim]")
-    page.goto(f"{real.url}/#/visit/{visit_of(page)}/film")
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/pictures")
     page.wait_for_selector(".pick")
     for pick in page.locator(".pick").all():
         pick.tap()
@@ -388,7 +408,7 @@ def test_visit_is_copied_to_usb_and_saved_as_zip(open_page: Open, real: Real) ->
     take_picture(page)
     visit = visit_of(page)
     real.mount()
-    page.goto(f"{real.url}/#/visit/{visit}/film")
+    page.goto(f"{real.url}/#/visit/{visit}/pictures")
     tap(page, "#copy")
     page.locator("[data-folder]").tap()
     expect(page.get_by_role("note")).to_contain_text("Copied to USB STICK.")
@@ -416,7 +436,7 @@ def test_markup_is_shown_as_text(open_page: Open, real: Real) -> None:
     visit = real.begin_visit(consent="agreed", sex="woman") | {"number": evil}
     page = open_page("about:blank", SIZES["phone"])  # a server that accepts no such number would not send it
     page.route(f"**/api/visits/{visit['id']}", lambda route: route.fulfill(json=visit))
-    page.goto(f"{real.url}/#/visit/{visit['id']}/person")
+    page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     expect(page.locator("h1")).to_contain_text("<img src=x onerror=alert(1)>")
     assert page.locator("img").count() == 0
     assert look_for_faults(page) == []
@@ -437,7 +457,7 @@ def test_visit_by_shortcut_keys(open_page: Open, real: Real) -> None:
     page.keyboard.press("4")
     expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
     page.keyboard.press("ArrowLeft")
-    page.wait_for_selector("[data-screen=person]")
+    page.wait_for_selector("[data-screen=patient]")
     page.keyboard.press("?")
     expect(page.locator("#menu")).to_be_visible()
     page.keyboard.press("Escape")

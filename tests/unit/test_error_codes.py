@@ -54,7 +54,7 @@ def page_codes() -> set[str]:
     found = table_codes() | set(re.findall(r'"([a-z]+\.[a-z-]+)"', same))
     for name in page_scripts():
         found |= set(re.findall(r'\bcode(?: [!=]==|:) "([a-z]+\.[a-z-]+)"', text(name)))
-        found |= set(re.findall(r'\b(?:lowerAlerts|endNotice)\("([a-z]+\.[a-z-]+)"', text(name)))
+        found |= set(re.findall(r'\b(?:lowerAlert|endNotice)\("([a-z]+\.[a-z-]+)"', text(name)))
     return found
 
 

@@ -28,7 +28,7 @@ export class LivePreview extends HTMLElement {
   #answeredMs = 0; // when the server last answered, with a frame or without one
   /** @type {{code: string} | null} */
   #hint = null; // aiming hint
-  #reported = { frame_s: 0, link_s: 0 };
+  #reported = { frameS: 0, linkS: 0 };
   #clearedMs = -Infinity; // frames from before this moment are not shown
   #abort = new AbortController();
   #canvas = document.createElement("canvas");
@@ -147,17 +147,17 @@ export class LivePreview extends HTMLElement {
 
   // Show the age of an old frame: aiming by an old frame is worse than without one.
   #updateAge() {
-    const age_ms = performance.now() - this.#takenMs;
-    const late = this.#active && this.#bitmap !== null && age_ms > LATE_MS;
+    const ageMs = performance.now() - this.#takenMs;
+    const late = this.#active && this.#bitmap !== null && ageMs > LATE_MS;
     this.#age.hidden = !late;
     this.toggleAttribute("late", late);
-    if (late) this.#age.textContent = t("aim.late", { s: number(age_ms / 1000, age_ms < 10000 ? 1 : 0) });
+    if (late) this.#age.textContent = t("aim.late", { s: number(ageMs / 1000, ageMs < 10000 ? 1 : 0) });
     // Without new frames from the camera the server answers in time: then the connection is not late.
-    const unanswered_ms = performance.now() - Math.max(this.#takenMs, this.#answeredMs);
-    const [frame_s, link_s] = [age_ms, unanswered_ms].map((ms) => (late ? Math.floor(ms / 1000) : 0));
+    const unansweredMs = performance.now() - Math.max(this.#takenMs, this.#answeredMs);
+    const [frameS, linkS] = [ageMs, unansweredMs].map((ms) => (late ? Math.floor(ms / 1000) : 0));
     const before = this.#reported;
-    this.#reported = { frame_s, link_s };
-    if (frame_s !== before.frame_s || link_s !== before.link_s) this.dispatchEvent(new CustomEvent("late", { detail: this.#reported }));
+    this.#reported = { frameS, linkS };
+    if (frameS !== before.frameS || linkS !== before.linkS) this.dispatchEvent(new CustomEvent("late", { detail: this.#reported }));
   }
 
   #draw() {

@@ -31,7 +31,7 @@ function psfText({ gain_db: gain = null }) {
 }
 
 export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
-  const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
+  const totalS = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
   const used = frames.filter((one) => one.used).length;
   const channels = report.channels ?? [];
@@ -44,7 +44,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
     ...(links.colour ? [["hue", t(channels.some((one) => one.white_ratio != null) ? "detail.hue.card" : "detail.hue.neutral")]] : []),
     ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
     ...(report.psf_cylinder ? [["psf", psfText(report.psf_cylinder)]] : []),
-    ["seconds", t("detail.seconds.value", { s: number(total_s, 2) })],
+    ["seconds", t("detail.seconds.value", { s: number(totalS, 2) })],
     ["calibration", calibration],
     ["id", id],
   ];

@@ -7,7 +7,9 @@ import { applyKey, isNumber } from "./numbers.js";
 import { playCue, resetPictureTools, takePicture } from "./capture.js";
 import { qrCode } from "./qr_code.js";
 import { navigate } from "./router.js";
-import { dismissAlert, lowerAlerts, raiseAlert } from "./alerts.js";
+import { dismissAlert, lowerAlert, lowerAlerts, raiseAlert } from "./alerts.js";
+import { previewActions } from "./aiming.js";
+import { refreshStatus, setControl } from "./status.js";
 import * as visits from "./visit.js";
 import { loadLanguage, t, today } from "../i18n/translate.js";
 
@@ -51,8 +53,8 @@ const navigationActions = {
     const { screen, visit, capture } = currentRoute();
     const fromExam = screen === "aim" || (screen === "picture" && !capture && !get().visit?.finished_at);
     if (get().asking) set({ asking: "" });
-    else if (fromExam) navigate({ screen: "person", visit });
-    else if (history.state?.depth && screen !== "person" && screen !== "outcome") history.back();
+    else if (fromExam) navigate({ screen: "patient", visit });
+    else if (history.state?.depth && screen !== "patient" && screen !== "outcome") history.back();
     else navigate({ screen: "home" }, { replace: !history.state?.depth });
   },
 
@@ -91,12 +93,12 @@ const examActions = {
 
   async toggleQrCode() {
     const drawn = await qrCode(visits.qrText(get()));
-    set({ code: get().code ? undefined : drawn });
+    set({ qrCode: get().qrCode ? null : drawn });
   },
 
-  openFilm: (visit) => {
+  openPictures: (visit) => {
     set({ visit });
-    navigate({ screen: "film", visit: visit.id });
+    navigate({ screen: "pictures", visit: visit.id });
   },
   openDetails: () => get().modules.details?.open(),
   openPicture: (slot, capture) => navigate({ screen: "picture", visit: currentRoute().visit, slot, capture }),
@@ -145,10 +147,10 @@ const pictureActions = {
 
   // Request a thumbnail again, each time after twice the wait.
   thumbFailed({ target }) {
-    const wait_ms = Number(target.dataset.waitMs ?? THUMB_RETRY_MS);
-    if (wait_ms > THUMB_RETRY_MAX_MS) return;
-    target.dataset.waitMs = 2 * wait_ms;
-    setTimeout(() => target.setAttribute("src", target.getAttribute("src")), wait_ms);
+    const waitMs = Number(target.dataset.waitMs ?? THUMB_RETRY_MS);
+    if (waitMs > THUMB_RETRY_MAX_MS) return;
+    target.dataset.waitMs = 2 * waitMs;
+    setTimeout(() => target.setAttribute("src", target.getAttribute("src")), waitMs);
   },
 
   // Scale a thumbnail to its illuminated disc, without the dark frame around it.
@@ -162,13 +164,13 @@ const pictureActions = {
 // ---- buttons of alerts, by the name in the table of alerts.js
 
 const alertButtons = {
-  ok: ({ code }) => lowerAlerts(code),
+  ok: ({ code }) => lowerAlert(code),
   later: dismissAlert,
   dateIsRight: dismissAlert,
-  retry: () => pageHooks.refreshStatus(),
+  retry: refreshStatus,
   useHere: async () => {
     const answer = await visits.alertOnError(() => requestControl(true));
-    if (answer) pageHooks.setControl(answer);
+    if (answer) setControl(answer);
   },
   otherEye() {
     lowerAlerts(({ code }) => code.startsWith("light."));
@@ -176,16 +178,16 @@ const alertButtons = {
     if (slot) goToAim(slot.id);
   },
   finish: () => examActions.finish(),
-  ask: () => navigate({ screen: "person", visit: currentRoute().visit }),
-  how: () => navigate(currentRoute().visit ? { screen: "film", visit: currentRoute().visit } : { screen: "history" }),
+  ask: () => navigate({ screen: "patient", visit: currentRoute().visit }),
+  how: () => navigate(currentRoute().visit ? { screen: "pictures", visit: currentRoute().visit } : { screen: "history" }),
   takeNow({ visit, slot }) {
-    lowerAlerts("power.lost");
+    lowerAlert("power.lost");
     if (visit && slot) navigate({ screen: "aim", visit, slot });
   },
   see: () => navigate({ screen: "send" }),
   why: () => navigate({ screen: "send" }),
   tryNow({ code }) {
-    lowerAlerts(code);
+    lowerAlert(code);
     visits.retryUploads();
   },
   next: () => examActions.next(),
@@ -193,7 +195,7 @@ const alertButtons = {
   couldNot: () => examActions.ask(),
   timer: () => set({ timer: Date.now() + PUPIL_REST_MS, now: Date.now() }),
   change({ id, slot }) {
-    lowerAlerts("eye.side");
+    lowerAlert("eye.side");
     visits.moveToOtherEye(slot ?? currentRoute().slot, id ?? currentShot(get())?.id);
   },
   keepEye({ code, id, slot }) {
@@ -231,13 +233,10 @@ const settingsActions = {
   },
 };
 
-/** Functions that app.js provides for the alert buttons. */
-/** @type {{refreshStatus: () => void, setControl: (answer: {mine: boolean}) => void}} */
-export const pageHooks = { refreshStatus: () => {}, setControl: () => {} };
-
 export const actions = {
   ...navigationActions,
   ...examActions,
+  ...previewActions,
   ...pictureActions,
   ...settingsActions,
   resetPictureTools,

@@ -10,9 +10,10 @@ import { calendarDay, has, t } from "../i18n/translate.js";
 
 const ASSERTIVE = /^(link\.lost|light\.|heat\.)/;
 
-// Highest priority first. Levels: `stop` blocks captures; `tell` is an advisory chip; `shot` belongs to one picture and
-// is shown on its card; `ask` is a question on that card. `wait_s`: seconds until the alert ends by itself; "n": the n
-// minutes that the server sent. A `wait_s` from the server takes precedence.
+// Highest priority first. Levels: `stop` blocks captures; `refused` is the reason of a refused request, in the prompt
+// bar where nothing blocks; `tell` is an advisory chip; `shot` belongs to one picture and is shown on its card; `ask` is
+// a question on that card. `wait_s`: seconds until the alert ends by itself; "n": the n minutes that the server sent. A
+// `wait_s` from the server takes precedence.
 /** @type {[string, string, string[], {wait_s?: number | "n"}?][]} */
 const TABLE = [
   ["link.lost", "stop", []],
@@ -104,7 +105,7 @@ const dismissed = new Set(); // codes that the user dismissed; hidden until the 
 /** Hide an alert on this page until it ends. */
 export function dismissAlert({ code }) {
   dismissed.add(code);
-  lowerAlerts(code);
+  lowerAlert(code);
 }
 
 /** Replace the server's alerts with the list `all`; those that are missing from the list have ended. */
@@ -118,7 +119,7 @@ export function syncNotices(all) {
 /** End an alert of the server; it is shown if it begins again. */
 export function endNotice(code) {
   dismissed.delete(code);
-  lowerAlerts(code);
+  lowerAlert(code);
 }
 
 /**
@@ -136,11 +137,24 @@ export function raiseAlert({ code: reported, from, ...vars }) {
   set({ alerts: Object.freeze([...get().alerts.filter((other) => other.code !== code), state].sort(worstFirst)) });
 }
 
-/** End the alerts with this code, or those for which `test(alert)` is true. */
-export function lowerAlerts(test) {
-  const code = SAME[test] ?? test;
-  const gone = typeof code === "function" ? code : (state) => state.code === code;
-  const left = get().alerts.filter((state) => !gone(state));
+/**
+ * Begin the alert of a refused request, with all that the server sent.
+ * @param {{code: string, message?: string, remedy?: string, vars: Record<string, any>}} problem
+ */
+export const raiseRefusal = ({ code, message, remedy, vars }) => raiseAlert({ code, message, remedy, ...vars, from: "press" });
+
+/**
+ * End the alert with this code.
+ * @param {string} reported
+ */
+export const lowerAlert = (reported) => lowerAlerts(({ code }) => code === (SAME[reported] ?? reported));
+
+/**
+ * End the alerts for which `isOver(alert)` is true.
+ * @param {(alert: import("./state.js").Alert) => boolean} isOver
+ */
+export function lowerAlerts(isOver) {
+  const left = get().alerts.filter((alert) => !isOver(alert));
   if (left.length !== get().alerts.length) set({ alerts: Object.freeze(left) });
 }
 
@@ -176,6 +190,6 @@ export function timeLeft(until) {
 // One timer for all countdowns; it changes the state only while a countdown is active.
 setInterval(() => {
   const { alerts, timer } = get();
-  lowerAlerts(({ until }) => until && until <= Date.now());
+  lowerAlerts(({ until }) => until > 0 && until <= Date.now());
   if (timer || alerts.some(({ until }) => until)) set({ now: Date.now() });
 }, 1000);

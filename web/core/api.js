@@ -184,13 +184,15 @@ const EVENTS = ["beat", "state", "stage", "verdict", "kept", "failed", "aim", "n
 /**
  * Event stream of the visible page, with heartbeat timeout and reconnection. A hidden page closes its stream, because
  * browsers allow six connections per origin.
- * Calls `handlers[type](data)` for each event and `handlers.link("live" | "lost")` on a change. Only received events
- * count: navigator.onLine does not describe the connection to this device.
+ * Calls `handlers[type](data, heartbeats)` for each event, with the number of heartbeats so far, and
+ * `handlers.link("live" | "lost")` on a change. Only received events count: navigator.onLine does not describe the
+ * connection to this device.
  */
 export class EventStream {
   #handlers;
   /** @type {EventSource | null} */
   #source = null;
+  #heartbeats = 0;
   #lastEventMs = 0;
   #openedMs = 0;
   #link = "opening";
@@ -219,7 +221,8 @@ export class EventStream {
       source.addEventListener(type, (event) => {
         this.#lastEventMs = performance.now();
         this.#setLink("live");
-        this.#handlers[type]?.(event.data ? JSON.parse(event.data) : {});
+        if (type === "beat") this.#heartbeats += 1;
+        this.#handlers[type]?.(event.data ? JSON.parse(event.data) : {}, this.#heartbeats);
       });
     }
   }
@@ -234,8 +237,8 @@ export class EventStream {
     const now = performance.now();
     if (now - this.#lastEventMs < HEARTBEAT_TIMEOUT_MS) return;
     this.#setLink("lost");
-    const wait_ms = this.#source.readyState === EventSource.CLOSED ? RECONNECT_MS / 2 : RECONNECT_MS;
-    if (now - this.#openedMs > wait_ms) this.#open();
+    const waitMs = this.#source.readyState === EventSource.CLOSED ? RECONNECT_MS / 2 : RECONNECT_MS;
+    if (now - this.#openedMs > waitMs) this.#open();
   }
 
   #setLink(link) {

@@ -6,7 +6,7 @@ import { newIdempotencyKey, getCapture, ApiError, send } from "./api.js";
 import { allowsLight, eyeOf, PICTURE_DEFAULTS, get, set, currentShot } from "./state.js";
 import { navigate } from "./router.js";
 import { buttonsChanged } from "./taps.js";
-import { lowerAlerts, raiseAlert, visibleAlerts } from "./alerts.js";
+import { lowerAlerts, raiseAlert, raiseRefusal, visibleAlerts } from "./alerts.js";
 import { alertOnError, refreshVisit } from "./visit.js";
 import { t } from "../i18n/translate.js";
 
@@ -63,7 +63,8 @@ async function submitCapture(visit, slot) {
 }
 
 // A failed capture that the server had begun is reported, because a good verdict may have been shown.
-function failShot(key, { code, message, remedy, vars }) {
+function failShot(key, problem) {
+  const { code, message, remedy } = problem;
   const shot = get().shots.find((one) => one.key === key);
   if (!shot || shot.over) return;
   const here = currentShot(get())?.key === key;
@@ -74,7 +75,7 @@ function failShot(key, { code, message, remedy, vars }) {
     else setShots(get().shots.filter((one) => one.key !== key));
     if (here) navigate({ screen: "aim", visit: shot.visit, slot: shot.slot }, { replace: true });
   }
-  if (here || !shot.id) raiseAlert({ code, message, remedy, ...vars, from: "press" }); // on other screens the chip of the lost picture is shown
+  if (here || !shot.id) raiseRefusal(problem); // on other screens the chip of the lost picture is shown
   refreshVisit(shot.visit);
 }
 
@@ -174,7 +175,7 @@ export async function openPicture(route) {
 
 /** Go to the patient and show an error: the address names a picture that does not belong to this visit. */
 export function rejectForeignCapture({ visit }, { test }) {
-  navigate({ screen: "person", visit }, { replace: true });
+  navigate({ screen: "patient", visit }, { replace: true });
   raiseAlert({ code: "capture.elsewhere", message: t(test ? "fault.test" : "fault.elsewhere"), remedy: "", from: "press" });
 }
 

@@ -2,15 +2,15 @@
 
 /**
  * @typedef {{screen: string, visit?: string, slot?: string, capture?: string, other?: string, day?: string}} Route
- * #/ · #/find · #/send · #/history[/DAY] · #/visit/ID/{person|outcome|film} · …/aim/SLOT · …/picture/SLOT[/CAPTURE]
+ * #/ · #/find · #/send · #/history[/DAY] · #/visit/ID/{patient|outcome|pictures} · …/aim/SLOT · …/picture/SLOT[/CAPTURE]
  * · …/compare/CAPTURE/OTHER
  */
 const VISIT_SCREENS = {
-  person: [],
+  patient: [],
   aim: ["slot"],
   picture: ["slot", "capture"],
   outcome: [],
-  film: [],
+  pictures: [],
   compare: ["capture", "other"],
 };
 const OPTIONAL = new Set(["capture picture"]);
@@ -20,13 +20,13 @@ export function parseRoute(hash) {
   const [head, ...rest] = hash.replace(/^#?\/?/, "").split("/").map(decoded);
   if (head === "find" || head === "send") return { screen: head };
   if (head === "history") return rest[0] ? { screen: "history", day: rest[0] } : { screen: "history" };
-  const [visit, screen = "person", ...parts] = rest;
+  const [visit, screen = "patient", ...parts] = rest;
   const names = VISIT_SCREENS[screen];
   if (head !== "visit" || !visit || !names) return { screen: "home" };
   const route = { screen, visit };
   for (const [i, name] of names.entries()) {
     if (parts[i]) route[name] = parts[i];
-    else if (!OPTIONAL.has(`${name} ${screen}`)) return { screen: "person", visit };
+    else if (!OPTIONAL.has(`${name} ${screen}`)) return { screen: "patient", visit };
   }
   return route;
 }

@@ -15,17 +15,17 @@ let context = null;
 export function play(name) {
   context ??= new AudioContext();
   if (context.state === "suspended") context.resume();
-  for (const [hz, begin_s, length_s] of NOTES[name]) note(hz, context.currentTime + begin_s, length_s);
+  for (const [hz, beginS, lengthS] of NOTES[name]) note(hz, context.currentTime + beginS, lengthS);
 }
 
-function note(hz, at_s, length_s) {
+function note(hz, atS, lengthS) {
   const tone = new OscillatorNode(context, { frequency: hz });
   const volume = new GainNode(context, { gain: 0 });
-  volume.gain.setValueAtTime(0, at_s);
-  volume.gain.linearRampToValueAtTime(GAIN, at_s + RAMP_S);
-  volume.gain.setValueAtTime(GAIN, at_s + length_s - RAMP_S);
-  volume.gain.linearRampToValueAtTime(0, at_s + length_s);
+  volume.gain.setValueAtTime(0, atS);
+  volume.gain.linearRampToValueAtTime(GAIN, atS + RAMP_S);
+  volume.gain.setValueAtTime(GAIN, atS + lengthS - RAMP_S);
+  volume.gain.linearRampToValueAtTime(0, atS + lengthS);
   tone.connect(volume).connect(context.destination);
-  tone.start(at_s);
-  tone.stop(at_s + length_s);
+  tone.start(atS);
+  tone.stop(atS + lengthS);
 }

@@ -30,6 +30,15 @@ export const PICTURE_DEFAULTS = Object.freeze({
   asking: "", // question in place of the controls: "reason" why not possible, "finish" without all pictures
 });
 
+// What was shown so far.
+const SHOWN = Object.freeze({
+  noticeCount: 0, // notice events received
+  shownFindings: Object.freeze([]), // texts of findings that were shown; a dismissed one is not shown again
+  interruptedShown: false, // the captures that a power cut interrupted were shown
+  promptedMs: 0, // begin of the display of `prompt`, performance.now()
+  readySinceMs: 0, // since then the aiming hint is "ready"; 0: it is another one
+});
+
 const settings = Object.freeze({
   voice: loadSetting("voice", ""), // speech language, if it differs from the page's
   sound: loadSetting("sound", "on") === "on",
@@ -63,7 +72,8 @@ const settings = Object.freeze({
  *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, outbox: any,
  *   finishing: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
  *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
- *   blink: boolean, front: number, code: {size: number, path: string} | undefined}} State
+ *   blink: boolean, front: number, qrCode: {size: number, path: string} | null, noticeCount: number,
+ *   shownFindings: readonly string[], interruptedShown: boolean, promptedMs: number, readySinceMs: number}} State
  */
 
 export const store = createStore(/** @type {State} */ ({
@@ -100,7 +110,8 @@ export const store = createStore(/** @type {State} */ ({
   timer: 0, // end of the rest of a small pupil, in milliseconds
   blink: false, // the compared pictures lie one over the other
   front: 0, // which of them is in front
-  code: undefined, // QR code of the outcome, while it is shown
+  qrCode: null, // of the outcome, while it is shown
+  ...SHOWN,
 }));
 
 export const { get, set } = store;

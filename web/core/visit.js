@@ -4,7 +4,7 @@ import { today } from "../i18n/translate.js";
 import { newIdempotencyKey, getMontage, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
 import { eyeOf, get, lostShots, missingPictures, otherEyeSlot, moveShot, set, pendingShots } from "./state.js";
 import { navigate } from "./router.js";
-import { lowerAlerts, raiseAlert } from "./alerts.js";
+import { lowerAlert, raiseAlert, raiseRefusal } from "./alerts.js";
 
 /** Run a request; on an error of the server raise an alert and return undefined. */
 export async function alertOnError(task) {
@@ -12,8 +12,7 @@ export async function alertOnError(task) {
     return await task();
   } catch (problem) {
     if (!(problem instanceof ApiError)) throw problem;
-    const { code, message, remedy, vars } = problem;
-    raiseAlert({ code, message, remedy, ...vars, from: "press" });
+    raiseRefusal(problem);
     return undefined;
   }
 }
@@ -33,7 +32,7 @@ let montagePoll = 0;
 
 /** Load the montage of each eye of the visit on the pictures screen; ask again while one is being computed. */
 export async function refreshMontages(visit) {
-  const isShown = () => get().route.screen === "film" && get().route.visit === visit;
+  const isShown = () => get().route.screen === "pictures" && get().route.visit === visit;
   const eyes = [...new Set((get().protocol?.slots ?? []).map(({ eye }) => eye))];
   const answers = await Promise.all(eyes.map(async (eye) => [eye, await alertOnError(() => getMontage(visit, eye))]));
   if (!isShown()) return;
@@ -69,14 +68,14 @@ export async function begin(number) {
   const visit = await alertOnError(() => send("POST", "/api/visits", number ? { number } : {}));
   if (!visit) return;
   set({ visit: Object.freeze(visit) });
-  navigate({ screen: "person", visit: visit.id });
+  navigate({ screen: "patient", visit: visit.id });
 }
 
 /** Continue a visit on the screen of its next step. */
 export function resume(visit) {
   set({ visit: Object.freeze(visit) });
   if (visit.finished_at) navigate({ screen: "outcome", visit: visit.id });
-  else if (visit.fields.consent !== "agreed" || !visit.next_slot) navigate({ screen: "person", visit: visit.id });
+  else if (visit.fields.consent !== "agreed" || !visit.next_slot) navigate({ screen: "patient", visit: visit.id });
   else navigate({ screen: "aim", visit: visit.id, slot: visit.next_slot });
 }
 
@@ -122,7 +121,7 @@ async function sendUnsaved() {
       if (!(problem instanceof ApiError)) throw problem;
       if (problem.code === "link.cut") return; // repeated when the connection is back
       unsaved = unsaved.filter((other) => other !== change);
-      raiseAlert({ code: problem.code, message: problem.message, remedy: problem.remedy, from: "press" });
+      raiseRefusal(problem);
       await refreshVisit(visit);
     }
   }
@@ -141,13 +140,13 @@ export async function couldNot(slot, reason) {
   const before = visit.slots[slot].capture;
   if (!(await change("could-not", { slot, reason }))) return;
   navigate({ screen: "aim", visit: visit.id, slot: nextSlot(slot) ?? slot });
-  lowerAlerts("shot.crossed");
+  lowerAlert("shot.crossed");
   raiseAlert({ code: "shot.crossed", visit: visit.id, slot, eye: eyeOf(get(), slot), before, from: "page" });
 }
 
 /** Undo "could not". */
 export async function undoCouldNot({ visit, slot, before }) {
-  lowerAlerts("shot.crossed");
+  lowerAlert("shot.crossed");
   const result = await alertOnError(() => send("POST", visitUrl(visit, "slots"), { slot, capture: before }));
   if (!result) return;
   storeVisit(result);
@@ -221,7 +220,7 @@ export async function finish({ isSure = false } = {}) {
   const { visit } = get().route;
   if (!visit) return;
   if (!isSure && missingPictures(get()) && get().visit?.fields.consent !== "declined") return set({ asking: "finish" });
-  lowerAlerts("shot.crossed"); // undo would need a reopened visit
+  lowerAlert("shot.crossed"); // undo would need a reopened visit
   if (pendingShots(get(), visit).length) {
     navigate({ screen: "outcome", visit });
     set({ finishing: visit });

@@ -1,14 +1,10 @@
-// History screens: patients of a day, pictures of a patient, comparison of two pictures with synchronised zoom. Loaded
-// on demand.
+// History screen: patients of a day. Loaded on demand.
 
-import { colourLink, finalPicture, montagePictureUrl, visitZipUrl } from "../core/api.js";
 import { patientList } from "./home.js";
-import { outcomeTexts, reopenButton } from "./outcome.js";
 import { icon } from "../components/icons.js";
-import { choice, slotLabel, thumb, whyGreen } from "../components/components.js";
-import { displayNumber } from "../core/numbers.js";
-import { html, nothing } from "../vendor/lit-html.js";
-import { calendarDay, clockTime, isoDay, t, today } from "../i18n/translate.js";
+import { choice } from "../components/components.js";
+import { html } from "../vendor/lit-html.js";
+import { calendarDay, isoDay, t, today } from "../i18n/translate.js";
 
 /** @typedef {import("../core/state.js").State} State */
 
@@ -42,7 +38,7 @@ export function history(state, actions) {
         options: filters.map((name) => [name, t(`show.${name}`)]),
         choose: (name) => (name === "waiting" ? actions.go({ screen: "send" }) : actions.setListFilter(name)), // the queue holds all days
       })}
-      ${listed.length ? patientList(listed, actions.openFilm) : html`<p class="muted">${t("history.none")}</p>`}
+      ${listed.length ? patientList(listed, actions.openPictures) : html`<p class="muted">${t("history.none")}</p>`}
     </section>
   `;
 }
@@ -52,163 +48,3 @@ const shiftDay = (day, days) => {
   date.setDate(date.getDate() + days);
   return isoDay(date);
 };
-
-// ---- pictures of one patient
-
-/** @param {State} state */
-export function film(state, actions) {
-  const { visit, picked } = state;
-  if (!visit) return nothing;
-  const taken = Object.entries(visit.slots).flatMap(([slot, { captures }]) => captures.map((id) => ({ slot, id })));
-  return html`
-    <section class="film">
-      <h2>${t("film.title", { number: displayNumber(visit.number) })}</h2>
-      ${visit.outcome ? html`<p>${outcomeTexts(visit.outcome, state.language).filter(Boolean).join(" · ")}</p>` : nothing}
-      ${whyGreen(visit) ? html`<p class="muted" id="green">${whyGreen(visit)}</p>` : nothing}
-      ${taken.length ? html`<ul>${taken.map((one) => captureItem(state, actions, one))}</ul>` : html`<p>${t("film.none")}</p>`}
-      ${Object.entries(state.montages).map(([eye, made]) => montage(visit, actions, eye, made))}
-      <div class="ends">
-        ${picked.length === 2
-          ? html`<button class="primary" type="button" id="compare" @click=${actions.compare}>${t("film.compare")}</button>`
-          : taken.length > 1
-            ? html`<p class="muted">${t("film.pick", { n: 2 - picked.length })}</p>`
-            : nothing}
-        ${visit.finished_at
-          ? reopenButton(visit, actions)
-          : html`<button type="button" @click=${() => actions.resume(visit)}>
-              ${t("home.continue", { number: displayNumber(visit.number) })}
-            </button>`}
-      </div>
-      ${taken.length ? exportControls(visit, state, actions) : nothing}
-    </section>
-  `;
-}
-
-/**
- * Return eye, field and, of several, the number of a capture.
- * @param {State} state
- */
-function captureLabel(state, id) {
-  const found = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id));
-  if (!found) return "";
-  const [slot, { captures }] = found;
-  return t(captures.length > 1 ? "film.name.n" : "film.name", { ...slotLabel(state, slot), n: captures.indexOf(id) + 1 });
-}
-
-/** Return whether this capture, of several, is the one in use. */
-const isUsed = ({ visit }, id) =>
-  Object.values(visit?.slots ?? {}).some(({ capture, captures }) => capture === id && captures.length > 1);
-/** @param {State} state */
-const usedMark = (state, id) =>
-  isUsed(state, id) ? html`<span class="used">${icon("check")} ${t("film.used")}</span>` : nothing;
-
-/** @param {State} state */
-function captureItem(state, actions, { slot, id }) {
-  const on = state.picked.includes(id);
-  return html`<li>
-    <button type="button" class="open" data-id=${id} @click=${() => actions.openPicture(slot, id)}>
-      <span class="thumb">${thumb(state.visit, id, actions)}</span> <span>${captureLabel(state, id)}</span>
-      ${usedMark(state, id)}
-    </button>
-    <button type="button" class="pick" aria-pressed=${on} @click=${() => actions.pick(id)}>
-      ${icon(on ? "check" : "circle")} ${t(on ? "film.picked" : "film.compare")}
-    </button>
-  </li>`;
-}
-
-/**
- * Montage of one eye: the joined pictures, or the reason why there are none; nothing without pictures of this eye.
- * @param {import("../core/state.js").Visit} visit
- */
-function montage(visit, actions, eye, { state, digest, pictures, placed }) {
-  if (!pictures) return nothing;
-  const used = placed.filter((one) => one.used).length;
-  const text = t(`montage.${state}`, { n: used });
-  const leftOut = state === "joined" && used < pictures ? t("montage.leftout") : "";
-  return html`<figure class="montage" data-eye=${eye} data-state=${state}>
-    <figcaption><b>${t(`eye.${eye}`)}</b> <span aria-live="polite">${text} ${leftOut}</span></figcaption>
-    ${state === "joined"
-      ? html`<eye-pic
-          aria-label=${t("montage.name", { eye: t(`eye.${eye}`), n: used })}
-          .subject=${digest}
-          .src=${{ url: montagePictureUrl(visit.id, eye, digest), mark: "final" }}
-          @fault=${actions.pictureFault}
-        ></eye-pic>`
-      : nothing}
-  </figure>`;
-}
-
-/**
- * @param {import("../core/state.js").Visit} visit
- * @param {State} state
- */
-function exportControls(visit, { folders, copied, zipped }, actions) {
-  const message = copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : "";
-  return html`
-    <div class="ends">
-      <a class="button" href=${visitZipUrl(visit.id)} download @click=${actions.zipped}>${t("film.zip")}</a>
-      <button type="button" id="copy" @click=${actions.listFolders}>${t("film.copy")}</button>
-      ${(folders ?? []).map(
-        (stick) => html`<button
-          type="button"
-          data-folder=${stick.id}
-          ?disabled=${!stick.is_writable}
-          @click=${() => actions.copyTo(stick)}
-        >
-          ${stick.is_writable ? stick.name : t("film.readonly", stick)}
-        </button>`,
-      )}
-    </div>
-    <p role="note">${zipped ? t("film.zipped") : message}</p>
-  `;
-}
-
-// ---- comparison: side by side, or one over the other
-
-/** @param {State} state */
-export function compare(state, actions) {
-  const { blink, redfree, loupe, route, front = 0 } = state;
-  return html`
-    <section class="compare" ?data-blink=${blink}>
-      <div class="ends">
-        ${choice({
-          label: t("compare.title"),
-          value: Boolean(blink),
-          options: [
-            [false, t("compare.side")],
-            [true, t("compare.blink")],
-          ],
-          choose: actions.setBlink,
-        })}
-        <button type="button" aria-pressed=${redfree} @click=${() => actions.setRedfree(!redfree)}>${t("tool.redfree")}</button>
-        <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => actions.setLoupe(!loupe)}>${t("tool.loupe")}</button>
-        ${blink
-          ? html`<button class="primary" type="button" id="swap" data-repeat @click=${actions.swap}>
-              ${t("compare.swap", { name: captureLabel(state, front ? route.capture : route.other) })}
-            </button>`
-          : nothing}
-      </div>
-      <div class="two">${[0, 1].map((i) => comparedPicture(state, actions, i))}</div>
-    </section>
-  `;
-}
-
-/** @param {State} state */
-function comparedPicture(state, actions, i) {
-  const { route, status, blink, front = 0, redfree, loupe } = state;
-  const id = [route.capture, route.other][i];
-  const taken = state.compared.find((one) => one.id === id);
-  return html`<figure class=${blink && i !== front ? "behind" : ""}>
-    <figcaption><b>${captureLabel(state, id)}</b> ${taken ? clockTime(taken.taken_at) : nothing} ${usedMark(state, id)}</figcaption>
-    <eye-pic
-      aria-label=${captureLabel(state, id)}
-      .head=${status}
-      .subject=${id}
-      .redfree=${redfree && !(taken && colourLink(taken, 0, state.visit))}
-      .loupe=${loupe}
-      .src=${taken ? finalPicture(taken, redfree, state.visit) : null}
-      @looked=${actions.linkZoom}
-      @loupe=${actions.loupeChanged}
-    ></eye-pic>
-  </figure>`;
-}

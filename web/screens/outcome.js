@@ -26,16 +26,16 @@ export function outcome(state, actions) {
       ${state.status?.sending && visit.outcome.code !== "declined" ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, actions)}
       <div class="ends">
         <button type="button" id="print" @click=${actions.print}>${t("outcome.print")}</button>
-        <button type="button" id="code" aria-expanded=${state.code !== undefined} @click=${actions.toggleQrCode}>
+        <button type="button" id="code" aria-expanded=${state.qrCode !== null} @click=${actions.toggleQrCode}>
           ${t("outcome.code")}
         </button>
-        <button type="button" id="film" @click=${() => actions.go({ screen: "film", visit: visit.id })}>${t("outcome.film")}</button>
+        <button type="button" id="pictures" @click=${() => actions.go({ screen: "pictures", visit: visit.id })}>${t("outcome.pictures")}</button>
         ${reopenButton(visit, actions)}
         <button class="primary big" type="button" id="done" @click=${() => actions.go({ screen: "home" })}>
           ${t("outcome.done")}
         </button>
       </div>
-      ${state.code ? qrFigure(state.code) : nothing} ${slip(visit, [headline, sentence], state)}
+      ${state.qrCode ? qrFigure(state.qrCode) : nothing} ${slip(visit, [headline, sentence], state)}
     </section>
   `;
 }
@@ -95,7 +95,7 @@ function qrFigure({ size, path }) {
  * @param {string[]} texts
  * @param {State} state
  */
-function slip(visit, [headline, sentence], { protocol, code: drawn }) {
+function slip(visit, [headline, sentence], { protocol, qrCode: drawn }) {
   const phone = protocol?.programme?.centre_phone;
   const moment = visit.finished_at ?? visit.begun_at;
   return html`<section class="slip" aria-hidden="true">

@@ -8,7 +8,7 @@ import { chips, patientLabel, standing } from "../components/components.js";
 import { aim } from "./aim.js";
 import { find, home } from "./home.js";
 import { outcome } from "./outcome.js";
-import { person } from "./patient.js";
+import { patient } from "./patient.js";
 import { picture } from "./picture.js";
 import { isExamScreen, pictureArea } from "../components/picture_area.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -18,7 +18,7 @@ import { has, t } from "../i18n/translate.js";
 
 const SPACE_PLENTY = 200; // patients; weeks of screening
 
-const SCREENS = { home, find, person, aim, picture, outcome };
+const SCREENS = { home, find, patient, aim, picture, outcome };
 
 /**
  * Template of the whole exam page.
@@ -26,7 +26,8 @@ const SCREENS = { home, find, person, aim, picture, outcome };
  */
 export function page(state, actions) {
   const { modules, route } = state;
-  const screen = (SCREENS[route.screen] ?? modules.history?.[route.screen] ?? modules.send?.[route.screen])?.(state, actions) ?? nothing;
+  const loaded = [modules.history, modules.pictures, modules.send].find((module) => module?.[route.screen]);
+  const screen = (SCREENS[route.screen] ?? loaded?.[route.screen])?.(state, actions) ?? nothing;
   const exam = isExamScreen(state);
   return html`
     <div class="page" data-screen=${route.screen} data-phase=${phase(state)} data-link=${state.link}>
@@ -78,7 +79,8 @@ function header(state, actions) {
 }
 
 // Free space in patients, as an exact number only when it is small.
-const spaceText = (patientList) => t(patientList > SPACE_PLENTY ? "space.plenty" : "space", { n: patientList > 50 ? Math.floor(patientList / 10) * 10 : patientList });
+const spaceText = (patients) => t(patients > SPACE_PLENTY ? "space.plenty" : "space", { n: patients > 50 ? Math.floor(patients / 10) * 10 : patients });
+
 // When every capture in progress has a verdict, the patient need not hold still, so "making" is shown instead of
 // "busy".
 function shownActivity({ activity, shots }) {
@@ -91,7 +93,7 @@ function title(route, visit, actions) {
   const label = patientLabel(visit);
   if (route.screen !== "aim" && route.screen !== "picture") return html`<h1>${label}</h1>`;
   return html`<h1>
-    <button class="quiet" type="button" id="who" @click=${() => actions.go({ screen: "person", visit: visit.id })}>${label}</button>
+    <button class="quiet" type="button" id="who" @click=${() => actions.go({ screen: "patient", visit: visit.id })}>${label}</button>
   </h1>`;
 }
 

@@ -32,13 +32,13 @@ const isDrops = (name) => name.startsWith("drops_");
 const fieldValue = (name, one) => (isDrops(name) ? (one ? new Date().toISOString() : null) : one);
 
 /** @param {State} state */
-export function person(state, actions) {
+export function patient(state, actions) {
   const { visit, modules } = state;
   if (!visit) return nothing;
   const { fields, waiting = [] } = visit;
   const questions = QUESTIONS.filter(([name]) => name !== "diabetes_years" || fields.diabetes === "yes");
   return html`
-    <section class="person">
+    <section class="patient">
       <h2>${t("consent")}</h2>
       ${modules.speech?.consentQuestion(state) ?? nothing}
       ${choice({
@@ -50,7 +50,7 @@ export function person(state, actions) {
       })}
       ${startButton(visit, state, actions)}
       <p class="muted" id="unsaved">${waiting.length ? t("save.waiting") : ""}</p>
-      <h2>${t("person.details")}</h2>
+      <h2>${t("patient.details")}</h2>
       <div class="questions">${questions.map(([name, answers]) => question(visit, actions, name, answers))}</div>
       ${textFields(visit, actions)}
     </section>
@@ -67,18 +67,18 @@ function startButton(visit, { protocol }, actions) {
   if (consent === "declined") {
     return html`<div class="go">
       <button class="primary big" type="button" id="finish" @click=${actions.finish}>
-        <span>${t("result.finish")}<small>${t("person.declined")}</small></span>
+        <span>${t("result.finish")}<small>${t("patient.declined")}</small></span>
       </button>
     </div>`;
   }
   const ready = consent === "agreed" && protocol !== null;
   return html`<div class="go">
     <button class="primary big" type="button" id="shoot" aria-disabled=${!ready} @click=${() => ready && actions.startAiming()}>
-      ${icon("camera")} <span>${t(ready ? "person.shoot" : "person.ask")}</span>
+      ${icon("camera")} <span>${t(ready ? "patient.shoot" : "patient.ask")}</span>
     </button>
     ${any
-      ? html`<button type="button" id="film" @click=${() => actions.go({ screen: "film", visit: visit.id })}>
-          ${t("person.film")}
+      ? html`<button type="button" id="pictures" @click=${() => actions.go({ screen: "pictures", visit: visit.id })}>
+          ${t("patient.pictures")}
         </button>`
       : nothing}
   </div>`;
@@ -139,7 +139,7 @@ function textFields(visit, actions) {
     </label>
   `;
   return html`<details>
-    <summary>${t("person.words")}</summary>
+    <summary>${t("patient.words")}</summary>
     ${box("name", "text")} ${box("phone", "tel")} ${box("village", "text")}
   </details>`;
 }

@@ -31,7 +31,7 @@ const nextTryText = (wait) => (wait > 0 ? t("send.next", { n: Math.ceil(wait / 6
 
 function outboxItem({ visit, number: who, since, size_bytes: size, tries, error, stuck }, actions) {
   return html`<li data-stuck=${stuck}>
-    <button type="button" data-visit=${visit} @click=${() => actions.go({ screen: "film", visit })}>
+    <button type="button" data-visit=${visit} @click=${() => actions.go({ screen: "pictures", visit })}>
       <span>${who}</span> <span class="muted">${calendarDay(since)}, ${clockTime(since)}</span>
       <span class="end">
         ${t("send.size", { n: number(size / 1e6) })}${tries ? ` · ${t("send.tries", { n: tries })}` : ""}

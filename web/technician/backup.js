@@ -69,7 +69,7 @@ class Backup extends HTMLElement {
     },
     listDrives: async () => {
       const answer = await this.#request("/api/exports");
-      if (answer) this.#set({ sticks: answer.folders, error: "", message: answer.folders.length ? "" : t("film.nofolder") });
+      if (answer) this.#set({ sticks: answer.folders, error: "", message: answer.folders.length ? "" : t("pictures.nofolder") });
     },
     begin: async ({ id }) => {
       this.#set({ sticks: null, message: "", error: "" });
@@ -113,7 +113,7 @@ const progressBar = ({ done, total }) => html`<label class="progress">${t("backu
 const driveButtons = (sticks, actions) => html`<div class="row">
   ${sticks?.length
     ? sticks.map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} ?disabled=${!stick.is_writable} @click=${() => actions.begin(stick)}>
-        ${stick.is_writable ? t("backup.to", { name: stick.name }) : t("film.readonly", stick)}
+        ${stick.is_writable ? t("backup.to", { name: stick.name }) : t("pictures.readonly", stick)}
       </button>`)
     : html`<button class="primary" type="button" id="back-up" @click=${actions.listDrives}>${t("backup.begin")}</button>`}
   <button type="button" id="new-passphrase" @click=${actions.choose}>${t("backup.choose")}</button>

@@ -44,10 +44,10 @@ class EventLog extends HTMLElement {
       this.#state.about = about;
       this.#load();
     },
-    saved: () => this.#set({ folders: null, message: t("film.zipped"), error: "" }),
+    saved: () => this.#set({ folders: null, message: t("pictures.zipped"), error: "" }),
     listDrives: async () => {
       const answer = await this.#request("/api/exports");
-      if (answer) this.#set({ folders: answer.folders, message: answer.folders.length ? "" : t("film.nofolder"), error: "" });
+      if (answer) this.#set({ folders: answer.folders, message: answer.folders.length ? "" : t("pictures.nofolder"), error: "" });
     },
     copy: async ({ id, name }) => {
       const done = await this.#request("/api/technician/event-log/export", { ...EXPORT, body: JSON.stringify({ folder: id }) });
@@ -66,9 +66,9 @@ function view({ entries, warningsOnly, about, folders, message, error }, actions
       <button type="button" @click=${actions.again}>${t("event-log.again")}</button>
       <button type="button" aria-pressed=${warningsOnly} @click=${actions.warningsOnly}>${t("event-log.worst")}</button>
       <a class="button" href="/api/technician/event-log.txt" download @click=${actions.saved}>${t("event-log.save")}</a>
-      <button type="button" id="to-usb" @click=${actions.listDrives}>${t("film.copy")}</button>
+      <button type="button" id="to-usb" @click=${actions.listDrives}>${t("pictures.copy")}</button>
       ${(folders ?? []).map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} ?disabled=${!stick.is_writable} @click=${() => actions.copy(stick)}>
-        ${stick.is_writable ? stick.name : t("film.readonly", stick)}
+        ${stick.is_writable ? stick.name : t("pictures.readonly", stick)}
       </button>`)}
     </div>
     ${error ? html`<p class="bad" role="alert">${error}</p>` : nothing}

@@ -142,10 +142,10 @@ const STAGES = {
 
 // Return the duration of the last update on this device, else an estimate; no estimate for a download, whose speed is
 // unknown.
-function duration({ took_s: took }, guess_s) {
+function duration({ took_s: took }, guessS) {
   const minutes = (seconds) => Math.max(1, Math.ceil(seconds / 60));
   const known = took ? t("update.took", { n: minutes(took) }) : "";
-  const guessed = guess_s ? t("update.guess", { from: minutes(guess_s[0]), n: minutes(guess_s[1]) }) : "";
+  const guessed = guessS ? t("update.guess", { from: minutes(guessS[0]), n: minutes(guessS[1]) }) : "";
   return html`<p>${known || guessed} ${t("update.itself")}</p>`;
 }
 
@@ -201,7 +201,7 @@ function choices(status, waiting, sent, actions) {
   `;
 }
 
-function bundleItem(status, { id, where, stick, name, bytes, version, trouble: no, takes_s: guess_s }, actions) {
+function bundleItem(status, { id, where, stick, name, bytes, version, trouble: no, takes_s: guessS }, actions) {
   const place = t(`update.from.${where}`, { stick: stick || name });
   return html`
     <li data-id=${id} data-code=${no?.code ?? "ok"}>
@@ -209,7 +209,7 @@ function bundleItem(status, { id, where, stick, name, bytes, version, trouble: n
       <small>${place} · ${name} · ${t("update.megabytes", { n: number(bytes / 1e6, 0) })}</small>
       ${no
         ? html`<p class="bad">${errorText(no)}</p>`
-        : html`${duration(status, guess_s)} ${paragraph("update.power")}
+        : html`${duration(status, guessS)} ${paragraph("update.power")}
             <button type="button" class="primary" @click=${() => actions.install(id)}>${t("update.install", { version })}</button>`}
     </li>
   `;

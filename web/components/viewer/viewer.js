@@ -142,7 +142,7 @@ export class PictureViewer extends HTMLElement {
 
   // ---- picture and tools
 
-  async #load(src, wait_ms = RETRY_MIN_MS) {
+  async #load(src, waitMs = RETRY_MIN_MS) {
     const { url, blob, mark } = src;
     const { signal } = this.#loading;
     try {
@@ -155,19 +155,19 @@ export class PictureViewer extends HTMLElement {
       this.dispatchEvent(new CustomEvent("drawn", { detail: { url, mark, grey } }));
     } catch (problem) {
       if (signal.aborted || src !== this.#src) return;
-      if (problem instanceof TypeError) this.#loadLater(src, wait_ms);
+      if (problem instanceof TypeError) this.#loadLater(src, waitMs);
       else this.dispatchEvent(new CustomEvent("fault", { detail: { url, mark } }));
     }
   }
 
   // No answer, or an error of the server: say so and request the picture again, until another one is selected.
-  #loadLater(src, wait_ms) {
+  #loadLater(src, waitMs) {
     const { signal } = this.#loading;
     this.#message.textContent = t("fault.picture.retry");
     this.#message.hidden = false;
     setTimeout(() => {
-      if (!signal.aborted && src === this.#src) this.#load(src, Math.min(2 * wait_ms, RETRY_MAX_MS));
-    }, wait_ms);
+      if (!signal.aborted && src === this.#src) this.#load(src, Math.min(2 * waitMs, RETRY_MAX_MS));
+    }, waitMs);
   }
 
   /**
