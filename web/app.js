@@ -14,7 +14,7 @@ import { startRouter, navigate } from "./core/router.js";
 import { lowerAlert, lowerAlerts, endNotice, raiseAlert } from "./core/alerts.js";
 import { refreshStatus, renewControl } from "./core/status.js";
 import { render } from "./vendor/lit-html.js";
-import { finishWhenComplete, alertOnError, refreshHome, refreshList, refreshMontages, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
+import { finishWhenComplete, alertOnError, refreshHome, refreshList, refreshMontages, refreshUploadQueue, refreshVisit, flushUnsaved } from "./core/visit.js";
 import { loadLanguage, today } from "./i18n/translate.js";
 
 /** @typedef {import("./core/state.js").State} State */
@@ -80,7 +80,7 @@ async function loadRoute(route) {
   for (const name of MODULES_OF_SCREEN[route.screen] ?? []) loadModule(name);
   if (route.screen === "home") refreshHome();
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
-  if (route.screen === "send") refreshOutbox();
+  if (route.screen === "send") refreshUploadQueue();
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });
   if (!route.visit) return;
   if (get().visit?.id !== route.visit) set({ visit: null });
@@ -130,7 +130,7 @@ const eventHandlers = {
   beat(data, heartbeats) {
     // While a status alert is shown, poll at every heartbeat, so that the alert ends soon after its cause.
     if (heartbeats % STATUS_BEATS === 0 || get().alerts.some(({ from }) => from === "status")) refreshStatus();
-    else if (get().route.screen === "send" && heartbeats % LEASE_BEATS === 1) refreshOutbox();
+    else if (get().route.screen === "send" && heartbeats % LEASE_BEATS === 1) refreshUploadQueue();
     else if (heartbeats % LEASE_BEATS === 0 && get().hasControl) renewControl();
   },
 

@@ -134,12 +134,12 @@ class MemoryLedger:
     """Dose ledger in memory, for tests and for tools that light no eye; not durable."""
 
     def __init__(
-        self, clock: Clock, window_s: float = 86400.0, page: DoseLedgerState | None = None, boot: str = "this"
+        self, clock: Clock, window_s: float = 86400.0, state: DoseLedgerState | None = None, boot: str = "this"
     ) -> None:
         self._clock = clock
         self._window_s = window_s
         self._boot = boot
-        self.state = page or DoseLedgerState()
+        self.state = state or DoseLedgerState()
         self._advanced()
 
     def spent_j_per_cm2(self, eye: Eye) -> float:

@@ -23,7 +23,7 @@ from services.records.record_files import CAPTURE_RECORD
 # computer, which another one has to make again; the identity of the device, since a restored device is another one.
 _DATABASE_LOGS = (f"{schema.DATABASE}-{suffix}" for suffix in snapshots.LOG_SUFFIXES)
 NOT_BACKED_UP = frozenset(
-    {*_DATABASE_LOGS, "snapshots", "replaced", "plans", "explorer", reserve_file.NAME, device_identity.FILE}
+    {*_DATABASE_LOGS, "snapshots", "replaced", "plans", "accuracy", reserve_file.NAME, device_identity.FILE}
 )
 
 

@@ -131,7 +131,7 @@ def serve(
         archive = Archive(archive_path(spec, data))
         event_log = undo.enter_context(closing(EventLog(data / "event-log")))
         context = AppContext(spec, archive, store, EventBus(), clock, watchdog, stop.failed)
-        explorer = AccuracyExplorer(data / "explorer", data / "plans", clock, spec, context.event_bus.publish, measure)
+        explorer = AccuracyExplorer(data / "accuracy", data / "plans", clock, spec, context.event_bus.publish, measure)
 
         exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, protocol)
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))

@@ -151,7 +151,7 @@ class AccuracyExplorer:
 
     def _report(self, message: str) -> None:
         self._message = message
-        self.publish("explorer", said=message)
+        self.publish("accuracy", progress=message)
 
     def _measured(self) -> MeasuredFrontier | None:
         stored = self._read("frontier.json")

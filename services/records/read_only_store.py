@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 MEMORY = Path("/dev/shm")  # the folder of temporary files may be on the disk that refuses
 READ_FROM_DISK = ("captures", "calibrations", "quarantine", "damaged", "conflicts")
-NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "explorer"})
+NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "accuracy"})
 
 
 @contextmanager

@@ -49,10 +49,10 @@ class SlotState:
     decision: SlotDecision | None = None
 
     @property
-    def state(self) -> Literal["empty", "taken", "could_not"]:
-        """Return `could_not` for a decision with a reason, `taken` if there is a chosen capture, else `empty`."""
+    def state(self) -> Literal["empty", "taken", "not_possible"]:
+        """Return `not_possible` for a decision with a reason, `taken` if there is a chosen capture, else `empty`."""
         if self.decision is not None and self.decision.reason is not None:
-            return "could_not"
+            return "not_possible"
         return "empty" if self.chosen is None else "taken"
 
     @property
@@ -165,10 +165,10 @@ def _is_below(vision: FormValue, limit: Vision) -> bool:
 def _missing_pictures(protocol: Protocol, slots: Mapping[str, SlotState]) -> list[str]:
     """Return a phrase for each group of eyes without any picture, or with a required picture that was not possible.
 
-    Not possible: the slot has the state `could_not`. A required slot that is only empty adds no phrase if the eye has
-    another picture.
+    Not possible: the slot has the state `not_possible`. A required slot that is only empty adds no phrase if the eye
+    has another picture.
     """
-    failed = {slot.eye for slot in protocol.slots if slot.required and slots[slot.id].state == "could_not"}
+    failed = {slot.eye for slot in protocol.slots if slot.required and slots[slot.id].state == "not_possible"}
     seen = {slot.eye for slot in protocol.slots if slots[slot.id].state == "taken"}
     phrases: tuple[tuple[str, list[Eye]], ...] = (
         ("picture of {} not possible", [eye for eye in protocol.eyes if eye in failed and eye not in seen]),

@@ -69,7 +69,7 @@ def photograph(page: Page, real: Real, standing: StandingAlerts, folder: Path) -
         camera.take(code)
     at(f"visit/{visit}/aim/R-centre", "eye-live[data-frame]", "aim")
     states(camera, real)
-    camera.tap("#could-not")
+    camera.tap("#not-possible")
     camera.take("why", ".reasons")
     camera.tap("#not-asked")
     shots(camera, real)
@@ -125,7 +125,7 @@ def shots(camera: Camera, real: Real) -> None:
     for _ in range(3):
         camera.tap("#shutter")
         page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
-        camera.take("shot-poor") if page.locator("#could-not").count() else None
+        camera.take("shot-poor") if page.locator("#not-possible").count() else None
         camera.tap("#again")
     real.show(None)
     camera.tap("#shutter")

@@ -38,19 +38,19 @@ def sections(camera: Camera, server: Server) -> None:
     if page.locator("#overview").count():  # result of a calibration that this browser has not dismissed
         camera.tap("#overview")
     camera.take("calibration", "[data-view=overview]")
-    for room, ready in (
+    for section, ready in (
         ("health", "li[data-check]"),
-        ("explorer", "accuracy-time svg"),
+        ("accuracy", "accuracy-time svg"),
         ("event-log", ".event-log li"),
         ("update", ".update"),
     ):
-        open_section(page, room)
-        camera.take(room, ready)
-        page.screenshot(path=camera.folder / f"{room}-whole.png", full_page=True)
-    open_section(page, "explorer")
+        open_section(page, section)
+        camera.take(section, ready)
+        page.screenshot(path=camera.folder / f"{section}-whole.png", full_page=True)
+    open_section(page, "accuracy")
     page.locator("tbody tr button").last.tap()
     expect(page.locator("eye-pic").nth(1)).to_have_attribute("data-mark", "final", timeout=60_000)
-    page.screenshot(path=camera.folder / "explorer-beside-whole.png", full_page=True)
+    page.screenshot(path=camera.folder / "accuracy-beside-whole.png", full_page=True)
     page.route("**/api/health", lambda route: route.fulfill(json=health_answer(run_checks(ILL))))
     open_section(page, "health")
     camera.take("health-ill", "li[data-ok=false]")
@@ -87,8 +87,8 @@ def main() -> None:
         (here / "head.toml").write_text(HEAD)
         server = Server(here / "data", str(here / "head.toml"))
         copy_small_plans(server.data)
-        (server.data / "explorer").mkdir(parents=True)
-        (server.data / "explorer" / "frontier.json").write_text(json.dumps(MEASURED))
+        (server.data / "accuracy").mkdir(parents=True)
+        (server.data / "accuracy" / "frontier.json").write_text(json.dumps(MEASURED))
         server.start()
         try:
             server.wait_until_ready()

@@ -57,7 +57,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
             real.press(visit_of(page), "R-nerve")
         strike(page, SHUTTER)
         page.wait_for_selector("[data-phase=kept] [data-verdict=again]")
-        strike(page, "#could-not")
+        strike(page, "#not-possible")
     strike(page, "[data-reason=still]")
     expect(page.locator(SHUTTER)).to_contain_text("Left eye · Centre")
     strike(page, SHUTTER)
@@ -67,7 +67,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
     strike(page, "#done")
     expect(page.locator(".day")).to_contain_text("1 done")
     states = [slot["state"] for slot in real.visit()["slots"].values()]
-    assert states == ["taken", "could_not", "taken", "empty"]
+    assert states == ["taken", "not_possible", "taken", "empty"]
     assert real.presses == 4
 
 

@@ -162,23 +162,23 @@ def test_picture_lost_during_finish_is_requested_again(open_page: Open, real: Re
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
-def test_could_not_is_set_and_undone_while_aiming(open_page: Open, real: Real, size: tuple[int, int]) -> None:
+def test_not_possible_is_set_and_undone_while_aiming(open_page: Open, real: Real, size: tuple[int, int]) -> None:
     page = aiming(open_page, real, size)
     assert look_for_faults(page, SHUTTER) == []
-    tap(page, "#could-not")
+    tap(page, "#not-possible")
     reasons = page.locator("[data-reason]")
     assert [one.get_attribute("data-reason") for one in reasons.all()][0::6] == ["lids", "other"]
     assert look_for_faults(page) == []
     tap(page, "[data-reason=lids]")
     tile = page.locator("[data-slot='R-centre']")
-    expect(tile).to_have_attribute("data-face", "could_not")
+    expect(tile).to_have_attribute("data-face", "not_possible")
     expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
     expect(page.locator("[data-code='shot.crossed']")).to_contain_text("Right eye, Centre: could not take it.")
     assert look_for_faults(page, SHUTTER) == []
     tap(page, "[data-do=uncross]")
     expect(tile).to_have_attribute("data-face", "empty")
     expect(page.locator(SHUTTER)).to_contain_text("Right eye · Centre")
-    tap(page, "#could-not")
+    tap(page, "#not-possible")
     tap(page, "[data-reason=other]")
     tap(page, "[data-slot='R-centre']")
     take_picture(page)
@@ -186,16 +186,16 @@ def test_could_not_is_set_and_undone_while_aiming(open_page: Open, real: Real, s
     assert real.visit()["slots"]["R-centre"]["reason"] is None
 
 
-def test_could_not_for_last_slot_offers_finish(open_page: Open, real: Real) -> None:
+def test_not_possible_for_last_slot_offers_finish(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     for slot in SLOTS:
         expect(page.locator(f"[data-slot='{slot}']")).to_have_attribute("aria-current", "step")
-        after_debounce(page).locator("#could-not").focus()
+        after_debounce(page).locator("#not-possible").focus()
         page.keyboard.press("Enter")
         page.locator("[data-reason=still]").focus()
         after_debounce(page).keyboard.press("Enter")
-        expect(page.locator(f"[data-slot='{slot}']")).to_have_attribute("data-face", "could_not")
-    expect(page.locator("#could-not")).to_have_count(0)
+        expect(page.locator(f"[data-slot='{slot}']")).to_have_attribute("data-face", "not_possible")
+    expect(page.locator("#not-possible")).to_have_count(0)
     expect(page.locator("#finish.primary")).to_have_text("Finish")
     assert real.visit()["finished_at"] is None
     tap(page, "#finish")

@@ -62,7 +62,7 @@ def test_a_message_moves_no_button(open_page: Open, real: Real, size: tuple[int,
             end()
             expect(page.locator(f"[data-code='{code}']")).to_have_count(0)
 
-    assert_still(("store.low", "batt.empty"), "[data-slot='R-centre']", ".actions", "#could-not", "#finish")
+    assert_still(("store.low", "batt.empty"), "[data-slot='R-centre']", ".actions", "#not-possible", "#finish")
     take_picture(page)
     expect(page.locator("#result-title")).to_have_text("Good")
     expect(page.locator("[data-code='make.slow']")).to_have_count(0)  # the card says that the worker can go on

@@ -235,7 +235,7 @@ def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: 
     real.rig.block_exposures()  # the camera gives no frame; the server answers in time
     expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[4-9]\.\d s old$"), timeout=15_000)
     expect(page.locator("[data-code='link.slow']")).to_have_count(0)
-    tap(page, "#could-not")
+    tap(page, "#not-possible")
     expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")
     expect(page.locator("eye-live")).to_have_css("visibility", "hidden")
     with page.expect_response("**/api/preview?*"):  # the server's last frame, which is old

@@ -181,7 +181,7 @@ def test_every_update_state_and_error_fits(device: Device, open_page: Open, comp
     """The test writes the updater's journal; the page is the real one."""
     complaints.expect("422")
     page = open_update(open_page, device)
-    page.route("**/api/outbox", lambda route: route.fulfill(json={"waiting": 3}))
+    page.route("**/api/upload-queue", lambda route: route.fulfill(json={"waiting": 3}))
     boot = boot_id()
     stages = {
         "looking": {},

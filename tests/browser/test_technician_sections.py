@@ -40,12 +40,12 @@ MEASURED = {
 @pytest.fixture(scope="module")
 def technician_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A real server with one capture and a stored accuracy-time measurement."""
-    folder = tmp_path_factory.mktemp("rooms")
+    folder = tmp_path_factory.mktemp("sections")
     (folder / "head.toml").write_text(HEAD.split("[calibration]")[0] + "[sim]\n")
     server = Server(folder / "data", str(folder / "head.toml"))
     copy_small_plans(server.data)
-    (server.data / "explorer").mkdir(parents=True)
-    (server.data / "explorer" / "frontier.json").write_text(json.dumps(MEASURED))
+    (server.data / "accuracy").mkdir(parents=True)
+    (server.data / "accuracy" / "frontier.json").write_text(json.dumps(MEASURED))
     server.start()
     server.wait_until_ready()
     body = json.dumps({"eye": "OD"}).encode()
@@ -63,9 +63,9 @@ def technician_page(open_page: Open, technician_server: Server, complaints: obje
     return page
 
 
-def open_section(page: Page, room: str) -> None:
-    page.locator(f"[data-room={room}]").tap()
-    expect(page.locator(f"[data-room={room}]")).to_have_attribute("aria-current", "page")
+def open_section(page: Page, section: str) -> None:
+    page.locator(f"[data-section={section}]").tap()
+    expect(page.locator(f"[data-section={section}]")).to_have_attribute("aria-current", "page")
 
 
 def layout_faults(page: Page, ready: str) -> list[str]:
@@ -132,7 +132,7 @@ def health_answer(checks: list[Check]) -> dict[str, Any]:
 
 
 def test_capture_is_recomputed_and_time_limit_is_stored(technician_page: Page) -> None:
-    open_section(technician_page, "explorer")
+    open_section(technician_page, "accuracy")
     expect(technician_page.locator("tbody tr")).to_have_count(2)  # the Pareto front
     technician_page.get_by_label("Also list what something better beats").tap()
     expect(technician_page.locator("tbody tr")).to_have_count(3)
@@ -149,7 +149,7 @@ def test_capture_is_recomputed_and_time_limit_is_stored(technician_page: Page) -
     technician_page.get_by_role("button", name="Best").tap()
     expect(technician_page.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
     technician_page.reload()
-    open_section(technician_page, "explorer")
+    open_section(technician_page, "accuracy")
     expect(technician_page.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
 
 

@@ -53,12 +53,12 @@ def screen(page: Page) -> str:
 
 
 def expect_face(page: Page, slot: str, face: str) -> None:
-    """Check the state that a slot's tile shows: good, poor, making, could_not or empty."""
+    """Check the state that a slot's tile shows: good, poor, making, not_possible or empty."""
     expect(page.locator(f".tiles [data-slot='{slot}']")).to_have_attribute("data-face", face)
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
-def test_visit_with_retake_and_could_not(open_page: Open, real: Real, size: tuple[int, int]) -> None:
+def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: tuple[int, int]) -> None:
     page = open_page(real.url, size)
     page.wait_for_selector("#new")
     faults = {"home": look_for_faults(page, "#new")}
@@ -100,16 +100,16 @@ def test_visit_with_retake_and_could_not(open_page: Open, real: Real, size: tupl
     real.show("saturated")
     for _ in range(2):
         take_picture(page)
-        assert page.locator("#could-not").count() == 0
+        assert page.locator("#not-possible").count() == 0
         tap(page, "#again")
     take_picture(page)
     real.show(None)
     expect(page.locator(".card")).to_contain_text("Not clear after 3 tries. That is useful to know.")
-    tap(page, "#could-not")
+    tap(page, "#not-possible")
     faults["why"] = look_for_faults(page)
     tap(page, "[data-reason=pupil]")
     expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
-    expect_face(page, "L-centre", "could_not")
+    expect_face(page, "L-centre", "not_possible")
 
     take_picture(page)
     expect(page.locator("#next")).to_contain_text("Finish")

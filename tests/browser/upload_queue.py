@@ -42,7 +42,7 @@ def queued(instruments: Instruments) -> Iterator[Queue]:
 
 
 def waiting(real: Real) -> list[dict[str, Any]]:
-    return list(real.request("GET", "/api/outbox")["visits"])
+    return list(real.request("GET", "/api/upload-queue")["visits"])
 
 
 def has_tried(real: Real, count: int) -> bool:

@@ -103,7 +103,7 @@ def _make_data(folder: Path) -> None:
             InterruptedCapture("20260302T120500-OS-abcdef", "OS", "v", "L-nerve", 1), "0" * 16
         )
         AccuracyExplorer(
-            rig.store.folder / "explorer", Path(place), clock, spec, lambda *_, **__: None, measure_scene
+            rig.store.folder / "accuracy", Path(place), clock, spec, lambda *_, **__: None, measure_scene
         ).choose("best")
         PinAuthenticator(rig.store.folder / "technician.json", clock).set_pin(PIN, None)
         visit = next(one for one in rig.request("GET", "/api/visits").json()["visits"] if one["number"] == "B-7")
@@ -140,7 +140,7 @@ def _visits(rig: Rig) -> None:
     known = {"name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54, "vision_od": "6/9"}
     sent = begin(consent="agreed", **known)
     pressed(sent, "R-centre", "R-nerve", "R-centre")
-    ask("POST", f"{sent}/could-not", slot="L-centre", reason="cloudy")
+    ask("POST", f"{sent}/not-possible", slot="L-centre", reason="cloudy")
     ask("POST", f"{sent}/finish")
     still_open = begin(number="B-7", consent="agreed", complaints=["pain"])
     moved = pressed(still_open, "L-centre")
@@ -149,10 +149,10 @@ def _visits(rig: Rig) -> None:
     ask("POST", f"{waits}/finish")
     ask("POST", "captures", eye="OS")
     until(lambda: not rig.exam.calibration_monitor.has_pending)
-    outbox = UploadQueue(rig.store.engine, rig.clock)
-    first, second = outbox.queued()
-    outbox.record_failure([first, second], ReceiverUnreachable("the receiver answers 503"))
-    outbox.record_success(first, UploadReceipt("5a" * 32, "sha256"))
+    queue = UploadQueue(rig.store.engine, rig.clock)
+    first, second = queue.queued()
+    queue.record_failure([first, second], ReceiverUnreachable("the receiver answers 503"))
+    queue.record_success(first, UploadReceipt("5a" * 32, "sha256"))
 
 
 # Reading
@@ -218,7 +218,7 @@ def _shown(visit: Visit, undo_until: datetime | None) -> dict[str, Any]:
 
 
 def _read_uploads(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
-    outbox = UploadQueue(store.engine, clock)
+    queue = UploadQueue(store.engine, clock)
     waiting = [
         {
             "visit": one.visit,
@@ -227,13 +227,13 @@ def _read_uploads(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
             "tries": one.tries,
             "failing_since": one.failing_since and one.failing_since.isoformat(),
             "error": one.error,
-            "said": one.message,
+            "message": one.message,
             "stuck": one.stuck,
             "size_bytes": one.size_bytes,
         }
-        for one in outbox.queued(sizes=True)
+        for one in queue.queued(sizes=True)
     ]
-    trouble = outbox.status()
+    trouble = queue.status()
     return {"waiting": waiting, "numbers": [trouble.waiting, trouble.stuck, trouble.failing]}
 
 
@@ -252,7 +252,7 @@ def _read_settings(folder: Path, clock: VirtualClock) -> dict[str, Any]:
     clock.sleep(10)
     door.log_in(PIN)
     spec = load_head(Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml")
-    chosen = AccuracyExplorer(folder / "data" / "explorer", folder, clock, spec, lambda *_, **__: None, measure_scene)
+    chosen = AccuracyExplorer(folder / "data" / "accuracy", folder, clock, spec, lambda *_, **__: None, measure_scene)
     send = load_settings(folder / "send.toml")
     return {
         "wrong pin": refused,

@@ -114,16 +114,16 @@ def _answers(log: Transcript, at: str) -> None:
 
 def _slots(log: Transcript, at: str, first: str, second: str) -> None:
     """Record the capture chosen for a slot, its eye, and the reason for a missing picture."""
-    log.ask("POST /api/captures/{id}/keep", f"/api/captures/{first}/keep", json=log.key())
-    log.ask("POST /api/captures/{id}/keep", f"/api/captures/{UNKNOWN_CAPTURE}/keep", json=log.key())
+    log.ask("POST /api/captures/{id}/accept", f"/api/captures/{first}/accept", json=log.key())
+    log.ask("POST /api/captures/{id}/accept", f"/api/captures/{UNKNOWN_CAPTURE}/accept", json=log.key())
     log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=None))
     log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=second))
     log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=UNKNOWN_CAPTURE))
     log.ask("POST /api/captures/{id}/eye", f"/api/captures/{first}/eye", json=log.key(eye="OS"))
     log.ask("POST /api/captures/{id}/eye", f"/api/captures/{first}/eye", json=log.key(eye="left"))
     log.ask("POST /api/captures/{id}/eye", f"/api/captures/{UNKNOWN_CAPTURE}/eye", json=log.key(eye="OS"))
-    log.ask("POST /api/visits/{id}/could-not", f"{at}/could-not", json=log.key(slot="L-nerve", reason="lids"))
-    log.ask("POST /api/visits/{id}/could-not", f"{at}/could-not", json=log.key(slot="L-nerve", reason="boredom"))
+    log.ask("POST /api/visits/{id}/not-possible", f"{at}/not-possible", json=log.key(slot="L-nerve", reason="lids"))
+    log.ask("POST /api/visits/{id}/not-possible", f"{at}/not-possible", json=log.key(slot="L-nerve", reason="boredom"))
 
 
 def _listing(log: Transcript, visit: dict[str, Any]) -> None:
@@ -403,12 +403,12 @@ def tablets() -> list[dict[str, Any]]:
         return log.exchanges
 
 
-def outbox() -> list[dict[str, Any]]:
+def uploads() -> list[dict[str, Any]]:
     """Record the upload queue: not set up, a waiting visit, a refused one, and a delivered one."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
-        log.ask("GET /api/outbox", note="no receiver is set up")
-        log.ask("POST /api/outbox/try", json=log.key(), note="no receiver is set up")
+        log.ask("GET /api/upload-queue", note="no receiver is set up")
+        log.ask("POST /api/upload-queue/retry", json=log.key(), note="no receiver is set up")
         first = log.exchanges
     receiver = Refusing()
     with instrument(carrier=receiver) as device:
@@ -416,43 +416,43 @@ def outbox() -> list[dict[str, Any]]:
         _finished_visit(log)
         log.exchanges.clear()
         device.clock.elapsed_s += BACKOFF_FIRST_S
-        log.ask("GET /api/outbox", note="one visit waits")
+        log.ask("GET /api/upload-queue", note="one visit waits")
         sender = device.application.upload_worker
         assert sender is not None
         assert sender.step()
-        log.ask("GET /api/outbox", note="the receiver refused it")
+        log.ask("GET /api/upload-queue", note="the receiver refused it")
         log.ask("GET /api/status", note="the receiver refused it")
-        log.ask("POST /api/outbox/try", json=log.key(visit="no such/visit"))
-        log.ask("POST /api/outbox/try", json=log.key())
+        log.ask("POST /api/upload-queue/retry", json=log.key(visit="no such/visit"))
+        log.ask("POST /api/upload-queue/retry", json=log.key())
         receiver.refuses = False
         assert sender.step()
-        log.ask("GET /api/outbox", note="it arrived")
+        log.ask("GET /api/upload-queue", note="it arrived")
         return first + log.exchanges
 
 
-def explorer() -> list[dict[str, Any]]:
+def accuracy() -> list[dict[str, Any]]:
     """Record accuracy against time: measurement, choice, and a capture reconstructed by another method."""
     with instrument() as device:
         log = Transcript(device)
         made = log.ask("POST /api/captures", json={"eye": "OD"})["id"]
         log.exchanges.clear()
         again, at = "GET /api/technician/captures/{id}/again.png", f"/api/technician/captures/{made}/again.png"
-        log.ask("GET /api/technician/explorer", note="no technician is logged in")
-        log.ask("POST /api/technician/explorer", note="no technician is logged in")
+        log.ask("GET /api/technician/accuracy", note="no technician is logged in")
+        log.ask("POST /api/technician/accuracy", note="no technician is logged in")
         log.ask("PUT /api/technician/pace", json={"pace": "best"}, note="no technician is logged in")
         log.ask(again, f"{at}?method=gradient", note="no technician is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
-        log.ask("GET /api/technician/explorer")
+        log.ask("GET /api/technician/accuracy")
         log.ask("PUT /api/technician/pace", json={"pace": "best"})
         log.ask("PUT /api/technician/pace", json={"pace": "never"})
         log.ask(again, f"{at}?method=gradient&bin=2&rounds=3")
         log.ask(again, f"{at}?method=guess")
         log.ask(again, f"{at}?method=gradient&bin=17")
         log.ask(again, f"/api/technician/captures/{UNKNOWN_CAPTURE}/again.png?method=gradient")
-        log.ask("POST /api/technician/explorer", note="a measurement begins")
-        log.ask("POST /api/technician/explorer", note="a measurement is under way")
+        log.ask("POST /api/technician/accuracy", note="a measurement begins")
+        log.ask("POST /api/technician/accuracy", note="a measurement is under way")
         until(lambda: not device.explorer.state().busy)
-        log.ask("GET /api/technician/explorer", note="measured")
+        log.ask("GET /api/technician/accuracy", note="measured")
         return log.exchanges
 
 
@@ -477,7 +477,7 @@ def security() -> list[dict[str, Any]]:
 
 CHAPTERS: dict[str, Chapter] = {
     one.__name__: one
-    for one in (captures, visits, exports, technician, calibration, updates, tablets, outbox, explorer, security)
+    for one in (captures, visits, exports, technician, calibration, updates, tablets, uploads, accuracy, security)
 }
 
 

@@ -266,7 +266,7 @@ def _owner(
     book = DoseLedgerStore(store.engine, clock, DAY_S, boot="once")
     coarse = spec.camera.model_copy(update={"rows": 68, "cols": 120, "pitch_um": 2 * spec.camera.pitch_um})
     measured = spec.model_copy(update={"camera": coarse})  # for the explorer: a quarter of the time
-    explorer = AccuracyExplorer(folder / "explorer", plans, clock, measured, bulletin.publish, measure_scene)
+    explorer = AccuracyExplorer(folder / "accuracy", plans, clock, measured, bulletin.publish, measure_scene)
 
     def exam() -> ExamService:
         head: Head = open_head(with_calibration(spec, root), clock, book)

@@ -11,7 +11,7 @@ ALWAYS = {  # public operations without input: the only refusal is that of a for
     "GET /api/health",
     "GET /api/protocol",
     "GET /api/exports",
-    "GET /api/outbox",
+    "GET /api/upload-queue",
     "GET /api/technician",
 }
 

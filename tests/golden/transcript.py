@@ -74,8 +74,8 @@ class Transcript:
         value = event[key]
         if key != "data":
             return value
-        if event["event"] == "explorer":
-            return {"said": "<progress>"}
+        if event["event"] == "accuracy":
+            return {"progress": "<progress>"}
         return self._normaliser.json(value, "verdict" if event["event"] in ("verdict", "stage", "aim") else "")
 
     def _add(self, operation: str, note: str, request: dict[str, Any], response: dict[str, Any]) -> None:

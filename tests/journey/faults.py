@@ -274,7 +274,7 @@ def fail_upload(rig: Rig, disk: DiskStub, answers: dict[str, int]) -> dict[str, 
     rig.request("POST", f"/api/visits/{visit}/finish", json={"key": key[::-1]})
     disk.receiver.answers = answers
     upload_pending(rig)
-    listed = rig.request("GET", "/api/outbox").json()
+    listed = rig.request("GET", "/api/upload-queue").json()
     assert (listed["configured"], listed["waiting"]) == (True, len(listed["visits"]))
     assert rig.request("GET", "/api/status").json()["sending"]["waiting"] == listed["waiting"]
     one: dict[str, Any] = next(one for one in listed["visits"] if one["visit"] == visit)
@@ -325,7 +325,7 @@ def upload_stuck(rig: Rig, disk: DiskStub) -> Observation:
     observed = active_alert(rig, "send.stuck")
     assert post_capture(rig).way == "verdict"
     disk.receiver.answers = {}
-    assert rig.request("POST", "/api/outbox/try", json={"key": "f" * 16}).json()["next_try_s"] == 0
+    assert rig.request("POST", "/api/upload-queue/retry", json={"key": "f" * 16}).json()["next_try_s"] == 0
     upload_pending(rig)
     assert_resolved(rig, "send.stuck")
     assert len(disk.receiver.kept) == before + 1
@@ -377,7 +377,7 @@ OF_THE_PAGE = {
     "link.slow": ("test_page_states.py", "test_old_live_frame_shows_its_age"),
     "light.cut": ("test_capture_edge_cases.py", "test_light_cut_returns_to_the_same_slot"),
     "shot.lost": ("test_capture_edge_cases.py", "test_lost_picture_is_reported_until_retaken"),
-    "shot.crossed": ("test_capture_edge_cases.py", "test_could_not_is_set_and_undone_while_aiming"),
+    "shot.crossed": ("test_capture_edge_cases.py", "test_not_possible_is_set_and_undone_while_aiming"),
 }
 
 

@@ -46,11 +46,11 @@ def messages() -> list[str]:
 
 @pytest.fixture
 def explorer(tmp_path: Path, spec: InstrumentSpec, messages: list[str]) -> AccuracyExplorer:
-    def publish(kind: str, said: str) -> None:
-        assert kind == "explorer"
-        messages.append(said)
+    def publish(kind: str, progress: str) -> None:
+        assert kind == "accuracy"
+        messages.append(progress)
 
-    return AccuracyExplorer(tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, publish, measure_scene)
+    return AccuracyExplorer(tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, publish, measure_scene)
 
 
 def test_a_diffuscope_error_crosses_the_process_boundary_with_its_remedy() -> None:
@@ -85,7 +85,7 @@ def test_a_measurement_uses_the_sensor_of_this_device_and_is_stored(
     assert any("timing, turn" in message for message in messages)
     assert messages[-1] == ""
     again = AccuracyExplorer(
-        tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, lambda kind, said: None, measure_scene
+        tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, lambda kind, progress: None, measure_scene
     )
     assert again.state().measured == found
 
@@ -108,10 +108,10 @@ def test_the_selected_time_budget_is_stored(explorer: AccuracyExplorer, tmp_path
     assert (explorer.pace, explorer.budget_s) == ("standard", 5.0)
     explorer.choose("best")
     again = AccuracyExplorer(
-        tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, lambda kind, said: None, measure_scene
+        tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, lambda kind, progress: None, measure_scene
     )
     assert (again.pace, again.budget_s) == ("best", 30.0)
-    (tmp_path / "explorer" / "choice.json").write_bytes(b"{half a fi")
+    (tmp_path / "accuracy" / "choice.json").write_bytes(b"{half a fi")
     assert again.pace == "standard"
 
 

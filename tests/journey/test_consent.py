@@ -119,7 +119,7 @@ def test_capture_without_a_visit_stays_a_test_picture(old_rig: Rig) -> None:
     assert json.loads(old_rig.store.read(made["id"], "report.json"))["test"] is True
     before = old_rig.request("GET", f"/api/visits/{visit}").json()
     for path, more in (
-        (f"/api/captures/{made['id']}/keep", {}),
+        (f"/api/captures/{made['id']}/accept", {}),
         (f"/api/captures/{made['id']}/eye", {"eye": "OS"}),
         (f"/api/captures/{made['id']}/eye", {"eye": "OD"}),
         (f"/api/visits/{visit}/slots", {"slot": "R-centre", "capture": made["id"]}),

@@ -80,7 +80,7 @@ def test_a_finished_visit_is_named_by_its_number_and_never_by_its_id(rig: Any) -
     rig.clock.elapsed_s += 2 * 86400
     for path, body in (
         ("/api/captures", press),
-        (f"/api/visits/{visit['id']}/could-not", {"key": next(keys), "slot": "R-centre", "reason": "lids"}),
+        (f"/api/visits/{visit['id']}/not-possible", {"key": next(keys), "slot": "R-centre", "reason": "lids"}),
         (f"/api/visits/{visit['id']}/reopen", {"key": next(keys)}),
     ):
         answer = rig.request("POST", path, json=body)
@@ -92,11 +92,11 @@ def test_a_finished_visit_is_named_by_its_number_and_never_by_its_id(rig: Any) -
 @pytest.mark.parametrize("reason", ["lids", "other"])
 def test_a_slot_marked_as_not_possible_can_be_taken_later(rig: Any, reason: str) -> None:
     visit = visit_with_consent(rig)["id"]
-    crossed = post(rig, f"/api/visits/{visit}/could-not", slot="R-nerve", reason=reason)
-    assert crossed["slots"]["R-nerve"]["state"] == "could_not"
+    crossed = post(rig, f"/api/visits/{visit}/not-possible", slot="R-nerve", reason=reason)
+    assert crossed["slots"]["R-nerve"]["state"] == "not_possible"
     back = post(rig, f"/api/visits/{visit}/slots", slot="R-nerve", capture=None)
     assert back["slots"]["R-nerve"]["state"] == "empty"
-    post(rig, f"/api/visits/{visit}/could-not", slot="R-nerve", reason=reason)
+    post(rig, f"/api/visits/{visit}/not-possible", slot="R-nerve", reason=reason)
     taken = shoot(rig, visit, "R-nerve")
     slot = rig.request("GET", f"/api/visits/{visit}").json()["slots"]["R-nerve"]
     assert (slot["state"], slot["capture"]) == ("taken", taken)
@@ -137,7 +137,7 @@ def test_a_capture_of_the_other_eye_is_moved_and_the_move_is_recorded(rig: Any) 
 def test_moving_a_chosen_capture_empties_its_old_slot(rig: Any) -> None:
     visit = visit_with_consent(rig)["id"]
     wrong = shoot(rig, visit, "R-centre")
-    post(rig, f"/api/captures/{wrong}/keep")
+    post(rig, f"/api/captures/{wrong}/accept")
     moved = post(rig, f"/api/captures/{wrong}/eye", eye="OS")
     assert moved["slots"]["R-centre"]["state"] == "empty"
     post(rig, f"/api/visits/{visit}/finish")

@@ -60,7 +60,7 @@ def test_each_visit_is_uploaded_once_and_complete_after_a_kill_during_the_upload
     receiver.after_put.set()
     with server.running() as process:
         until(lambda: sending(server) == {"sent": 2, "waiting": 0}, 60)
-        assert server.ask("GET", "/api/outbox")["visits"] == []
+        assert server.ask("GET", "/api/upload-queue")["visits"] == []
         receiver.gate.clear()
         requests = len(receiver.asked)
         finished(server, 32)

@@ -98,7 +98,7 @@ def test_a_retake_keeps_the_old_picture_and_the_user_chooses(old_rig: Any) -> No
     slot = old_rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
     assert slot["captures"] == [first["id"], second["id"]]
     assert slot["capture"] == second["id"]  # the newest of two that are equally good
-    kept = post(old_rig, f"/api/captures/{first['id']}/keep")
+    kept = post(old_rig, f"/api/captures/{first['id']}/accept")
     assert kept["slots"]["R-centre"]["capture"] == first["id"]
     emptied = post(old_rig, f"/api/visits/{visit['id']}/slots", slot="R-centre", capture=None)
     assert emptied["slots"]["R-centre"]["state"] == "empty"
@@ -158,12 +158,12 @@ def test_saturation_is_reported_without_a_reconstruction(make_rig: Any) -> None:
 def test_a_visit_without_possible_pictures_can_be_finished(old_rig: Any) -> None:
     visit = begin(old_rig)
     for slot, reason in zip(SLOTS, ["pupil", "cloudy", "still", "refused"], strict=True):
-        answer = post(old_rig, f"/api/visits/{visit['id']}/could-not", slot=slot, reason=reason)
-        assert answer["slots"][slot]["state"] == "could_not"
+        answer = post(old_rig, f"/api/visits/{visit['id']}/not-possible", slot=slot, reason=reason)
+        assert answer["slots"][slot]["state"] == "not_possible"
         assert answer["slots"][slot]["reason"] == reason
     ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
     assert ended["outcome"] == {"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}
-    where = f"/api/visits/{visit['id']}/could-not"
+    where = f"/api/visits/{visit['id']}/not-possible"
     refused(
         old_rig.request("POST", where, json={"key": next(keys), "slot": "R-centre", "reason": "pupil"}),
         409,
@@ -322,11 +322,11 @@ def test_inconsistent_requests_are_refused(old_rig: Any) -> None:
     ask(422, "input", "/api/captures", eye="OD", visit=visit["id"])
     ask(404, "store.unknown", "/api/captures", eye="OD", visit="unknown", slot="R-centre")
     ask(404, "store.unknown", "/api/captures", eye="OD", visit=visit["id"], slot="R-corner")
-    ask(404, "store.unknown", f"/api/captures/{alone['id']}/keep")
+    ask(404, "store.unknown", f"/api/captures/{alone['id']}/accept")
     ask(404, "store.unknown", f"/api/visits/{other['id']}/slots", slot="R-centre", capture=made["id"])
     ask(404, "store.unknown", f"{at}/slots", slot="R-nerve", capture=made["id"])
-    ask(404, "store.unknown", f"{at}/could-not", slot="R-corner", reason="pupil")
-    ask(422, "input", f"{at}/could-not", slot="R-nerve", reason="lazy")
+    ask(404, "store.unknown", f"{at}/not-possible", slot="R-corner", reason="pupil")
+    ask(422, "input", f"{at}/not-possible", slot="R-nerve", reason="lazy")
     ask(404, "store.unknown", "/api/visits/unknown/finish")
     ask(404, "store.unknown", "/api/visits/%00%ff/finish")
     refused(old_rig.request("GET", "/api/visits?day=today"), 422, "input")

@@ -125,7 +125,7 @@ class Lamp:
 class Disk:
     """Persistent state of the ledger, which survives the process, and whether the disk is full."""
 
-    page: DoseLedgerState = field(default_factory=DoseLedgerState)
+    state: DoseLedgerState = field(default_factory=DoseLedgerState)
     full: bool = False
 
 
@@ -199,7 +199,7 @@ class Eyes(RuleBasedStateMachine):
         self.start()
 
     def ledger(self) -> Ledger:
-        return MemoryLedger(self.times, DAY_S, self.disk.page, boot=str(self.boots))
+        return MemoryLedger(self.times, DAY_S, self.disk.state, boot=str(self.boots))
 
     def start(self) -> None:
         self.wrapped = LedgerOnDisk(self.ledger(), self.disk)

@@ -405,7 +405,7 @@ def test_picture_of_another_method(head: Path, tmp_path: Path, simulated: bool) 
     spec = load_head(head)
     scene = simulate_exposure(spec)
     explorer = AccuracyExplorer(
-        tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, lambda kind, **_: None, measure_scene
+        tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, lambda kind, **_: None, measure_scene
     )
     raw, dark = (raw_tiff(one, RawMetadata()) for one in (scene.counts, np.full_like(scene.counts, 64)))
     again = explorer.reconstruct(StoredCapture(raw, dark, scene.calibration, simulated), Recipe("tikhonov", 1))

@@ -121,7 +121,7 @@ def test_the_outcome_follows_the_rules_in_order(answers: dict[str, Any], slots: 
         else "declined"
         if answers.get("consent") == "declined"
         else "refer_picture"
-        if is_missing or "could_not" in states.values()
+        if is_missing or "not_possible" in states.values()
         else "send"
     )
     assert result.code == expected
@@ -162,12 +162,12 @@ def test_vision_at_the_limit_is_not_referred(vision: str) -> None:
     ("right", "left", "sentence"),
     [
         (
-            ("taken", "could_not"),
+            ("taken", "not_possible"),
             ("empty", "empty"),
             "Refer: not every picture of the right eye possible; picture of the left eye not taken.",
         ),
-        (("could_not", "empty"), ("could_not", "could_not"), "Refer: picture of both eyes not possible."),
-        (("taken", "taken"), ("could_not", "empty"), "Refer: picture of the left eye not possible."),
+        (("not_possible", "empty"), ("not_possible", "not_possible"), "Refer: picture of both eyes not possible."),
+        (("taken", "taken"), ("not_possible", "empty"), "Refer: picture of the left eye not possible."),
         (("taken", "empty"), ("taken", "taken"), "The pictures are kept, 1 not taken. They are for an eye specialist."),
         (("taken", "taken"), ("taken", "taken"), "The pictures are kept. They are for an eye specialist."),
     ],
@@ -176,6 +176,6 @@ def test_untaken_and_impossible_pictures_have_different_sentences(
     right: tuple[str, str], left: tuple[str, str], sentence: str
 ) -> None:
     refused = SlotState((), SlotDecision(None, "pupil"))
-    of = {"taken": SlotState((SlotCapture("a", None),)), "empty": SlotState(), "could_not": refused}
+    of = {"taken": SlotState((SlotCapture("a", None),)), "empty": SlotState(), "not_possible": refused}
     states = dict(zip(("R-centre", "R-nerve", "L-centre", "L-nerve"), (*right, *left), strict=True))
     assert decide_outcome(PROTOCOL, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence

@@ -87,9 +87,9 @@ def test_a_subscriber_with_a_closed_loop_does_not_disturb_publish() -> None:
 
 
 def test_an_event_is_formatted_as_a_server_sent_event() -> None:
-    text = sse_text(Event(7, "explorer", {"said": "a\nb: ä"}))
+    text = sse_text(Event(7, "accuracy", {"progress": "a\nb: ä"}))
     assert text.endswith("\n\n")
     fields = dict(line.split(": ", 1) for line in text.strip().split("\n"))
-    assert (fields["id"], fields["event"]) == ("7", "explorer")
-    assert json.loads(fields["data"]) == {"said": "a\nb: ä"}
+    assert (fields["id"], fields["event"]) == ("7", "accuracy")
+    assert json.loads(fields["data"]) == {"progress": "a\nb: ä"}
     assert "id:" not in sse_text(Event(0, "beat", {"number": 3}))

@@ -63,7 +63,7 @@ def test_the_best_picture_is_chosen_until_the_user_decides(store: CaptureStore, 
     shoot(store, people, visit, "R-centre", "poor-3", "again")
     assert chosen() == "poor-3"  # earlier captures stay unchosen
     people.pictures.mark_not_possible(next(keys), visit, "R-centre", "pupil")
-    assert people.get(visit).slots["R-centre"].state == "could_not"
+    assert people.get(visit).slots["R-centre"].state == "not_possible"
     shoot(store, people, visit, "R-centre", "late")
     assert people.get(visit).slots["R-centre"].state == "taken"
 

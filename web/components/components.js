@@ -4,7 +4,7 @@
 import { captureFileUrl } from "../core/api.js";
 import { displayNumber } from "../core/numbers.js";
 import { icon, target } from "./icons.js";
-import { currentShot, get, lostShots, missingPictures, slotPlan } from "../core/state.js";
+import { currentCapture, get, lostCaptures, missingPictures, slotPlan } from "../core/state.js";
 import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, has, t } from "../i18n/translate.js";
@@ -38,18 +38,18 @@ const TILE_FACES = {
   empty: ["circle", "tile.empty"], // known fields show their drawing instead
   good: ["star", "tile.good"],
   poor: ["pen", "tile.poor"],
-  could_not: ["cross", "tile.could_not"],
+  not_possible: ["cross", "tile.not_possible"],
   making: ["wait", "tile.making"],
   lost: ["warn", "tile.lost"],
 };
 
 /** @param {State} state */
 function faceOf(state, id) {
-  const { shots, visit } = state;
+  const { captures, visit } = state;
   const slot = visit?.slots[id];
-  if (shots.some((shot) => shot.visit === visit?.id && shot.slot === id && !shot.over)) return "making";
-  if (!slot || slot.state === "empty") return lostShots(state).some((shot) => shot.slot === id) ? "lost" : "empty";
-  if (slot.state === "could_not") return "could_not";
+  if (captures.some((capture) => capture.visit === visit?.id && capture.slot === id && !capture.over)) return "making";
+  if (!slot || slot.state === "empty") return lostCaptures(state).some((capture) => capture.slot === id) ? "lost" : "empty";
+  if (slot.state === "not_possible") return "not_possible";
   return slot.verdict?.word === "again" ? "poor" : "good";
 }
 
@@ -149,8 +149,8 @@ export function alertBar(one, actions) {
  * @param {State} state
  */
 export function chips(state, actions) {
-  const shot = currentShot(state);
-  const side = shot && state.alerts.find(({ level, id }) => level === "ask" && (!id || id === shot.id));
+  const capture = currentCapture(state);
+  const side = capture && state.alerts.find(({ level, id }) => level === "ask" && (!id || id === capture.id));
   const advisory = visibleAlerts(state).chips.filter(({ code }) => !isSaidElsewhere(state, code));
   const shown = side ? [side, ...advisory] : advisory;
   if (!shown.length) return nothing;
@@ -172,8 +172,8 @@ export function chips(state, actions) {
  * @param {string} code
  */
 function isSaidElsewhere(state, code) {
-  const shot = currentShot(state);
-  return (state.route.screen === "send" && code.startsWith("send.")) || (code === "make.slow" && Boolean(shot?.verdict || shot?.over));
+  const capture = currentCapture(state);
+  return (state.route.screen === "send" && code.startsWith("send.")) || (code === "make.slow" && Boolean(capture?.verdict || capture?.over));
 }
 
 const ALERT_LINKS = { technician: "/technician", pin: "/technician", setClock: "/technician" };
@@ -235,7 +235,7 @@ function reasons({ protocol, route }, actions) {
     <div class="reasons" role="group" aria-labelledby="why">
       <h2 id="why">${t("result.why")}</h2>
       ${(protocol?.reasons ?? []).map(
-        (reason) => html`<button type="button" data-reason=${reason} @click=${() => actions.couldNot(route.slot, reason)}>
+        (reason) => html`<button type="button" data-reason=${reason} @click=${() => actions.notPossible(route.slot, reason)}>
           ${has(`reason.${reason}`) ? t(`reason.${reason}`) : reason}
         </button>`,
       )}

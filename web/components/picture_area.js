@@ -2,7 +2,7 @@
 
 import { icon } from "./icons.js";
 import { colourLink, finalPicture } from "../core/api.js";
-import { allowsLight, consentOf, eyeOf, currentShot } from "../core/state.js";
+import { allowsLight, consentOf, eyeOf, currentCapture } from "../core/state.js";
 import { chips, slotLabel, standing, topAlert, alertBar, versionName, whyGreen } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
@@ -22,8 +22,8 @@ const litVisit = (state) => (state.hasControl && allowsLight(state) ? state.rout
  * @param {State} state
  */
 export function pictureArea(state, actions) {
-  const shot = currentShot(state);
-  const none = state.picture === "none" || !shot;
+  const capture = currentCapture(state);
+  const none = state.picture === "none" || !capture;
   return html`
     <section class="stage-area" aria-label=${t("part.live")} ?hidden=${!isExamScreen(state)}>
       <div class="stage" data-mark=${none ? "none" : state.picture}>
@@ -43,14 +43,14 @@ export function pictureArea(state, actions) {
           id="picture"
           class=${none ? "behind" : ""}
           tabindex=${none ? "-1" : "0"}
-          aria-label=${pictureName(state, shot)}
+          aria-label=${pictureName(state, capture)}
           .head=${state.status}
-          .subject=${shot?.key ?? null}
-          .redfree=${state.redfree && !(shot?.capture && colourLink(shot.capture, state.version, state.visit))}
+          .subject=${capture?.key ?? null}
+          .redfree=${state.redfree && !(capture?.record && colourLink(capture.record, state.version, state.visit))}
           .brightness=${state.brightness}
           .contrast=${state.contrast}
           .loupe=${state.loupe}
-          .src=${sourceOf(shot, state)}
+          .src=${sourceOf(capture, state)}
           @drawn=${actions.pictureDrawn}
           @fault=${actions.pictureFault}
           @zoomed=${actions.zoomed}
@@ -62,9 +62,9 @@ export function pictureArea(state, actions) {
   `;
 }
 
-function sourceOf(shot, { redfree, version, visit }) {
-  if (shot?.capture) return finalPicture(shot.capture, redfree, visit, version);
-  return shot?.quick ? { url: shot.quick, mark: "quick" } : null;
+function sourceOf(capture, { redfree, version, visit }) {
+  if (capture?.record) return finalPicture(capture.record, redfree, visit, version);
+  return capture?.quick ? { url: capture.quick, mark: "quick" } : null;
 }
 
 // ---- prompt line: while aiming a blocking alert or the hint; else eye and field, which no alert replaces, and the mark
@@ -111,22 +111,22 @@ function promptOf(state) {
 
 /** @param {State} state */
 function markPrompt(state) {
-  const shot = currentShot(state);
-  if (shot?.stage.name === "expose" && !shot.verdict && !shot.capture) return ["hold", "hand", t("make.expose")];
+  const capture = currentCapture(state);
+  if (capture?.stage.name === "expose" && !capture.verdict && !capture.record) return ["hold", "hand", t("make.expose")];
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
-  if (state.picture === "final" && shot?.verdict?.word === "again" && !state.version) return ["plain", "pen", [t("mark.final.again"), whyGreen(state.visit)].filter(Boolean).join(" · ")];
+  if (state.picture === "final" && capture?.verdict?.word === "again" && !state.version) return ["plain", "pen", [t("mark.final.again"), whyGreen(state.visit)].filter(Boolean).join(" · ")];
   if (state.picture === "final" && state.version) return ["done", "check", t("version.note")];
   if (state.picture === "final") return ["done", "check", [t("mark.final"), whyGreen(state.visit)].filter(Boolean).join(" · ")];
-  if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
+  if (!capture || capture.record) return ["wait", "wait", t("mark.opening")];
   return ["wait", "wait", t("make.refine")];
 }
 
 /** @param {State} state */
-function pictureName(state, shot) {
-  if (!shot || state.picture === "none") return t("pic.none");
-  const time = shot.capture ? clockTime(shot.capture.taken_at) : "";
-  const { eye, part } = slotLabel(state, shot.slot);
-  const shown = shot.capture?.versions?.find(({ number }) => number === state.version);
+function pictureName(state, capture) {
+  if (!capture || state.picture === "none") return t("pic.none");
+  const time = capture.record ? clockTime(capture.record.taken_at) : "";
+  const { eye, part } = slotLabel(state, capture.slot);
+  const shown = capture.record?.versions?.find(({ number }) => number === state.version);
   const mark = shown ? versionName(shown) : t(`mark.${state.picture}`);
-  return t("pic.name", { mark, eye: eye || t(`eye.${eyeOf(state, shot.slot)}`), part, time });
+  return t("pic.name", { mark, eye: eye || t(`eye.${eyeOf(state, capture.slot)}`), part, time });
 }

@@ -30,7 +30,7 @@ function psfText({ gain_db: gain = null }) {
   return gain === null ? t("detail.psf.cylinder") : t("detail.psf.gain", { db: number(gain, 1) });
 }
 
-export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
+export function detailsDialog({ grey, visit }, actions, { record: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
   const totalS = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
   const used = frames.filter((one) => one.used).length;

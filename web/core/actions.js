@@ -2,7 +2,7 @@
 
 import { fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
-import { get, otherEyeSlot, saveSetting, set, currentShot } from "./state.js";
+import { get, otherEyeSlot, saveSetting, set, currentCapture } from "./state.js";
 import { applyKey, isNumber } from "./numbers.js";
 import { playCue, resetPictureTools, takePicture } from "./capture.js";
 import { qrCode } from "./qr_code.js";
@@ -60,11 +60,11 @@ const navigationActions = {
 
   /** Show the picture of a slot; if the slot is empty, aim at it. */
   chooseTile(slot) {
-    const { visit, shots } = get();
+    const { visit, captures } = get();
     if (!visit) return;
-    const pendingShots = shots.some((shot) => shot.visit === visit.id && shot.slot === slot && !shot.over);
+    const pendingCaptures = captures.some((capture) => capture.visit === visit.id && capture.slot === slot && !capture.over);
     lowerAlerts(({ from }) => from === "press");
-    if (pendingShots || visit.finished_at || visit.slots[slot].captures.length) navigate({ screen: "picture", visit: visit.id, slot });
+    if (pendingCaptures || visit.finished_at || visit.slots[slot].captures.length) navigate({ screen: "picture", visit: visit.id, slot });
     else goToAim(slot);
   },
 };
@@ -74,11 +74,11 @@ const examActions = {
   again: () => goToAim(currentRoute().slot),
   keepPrevious: () => navigate({ screen: "picture", visit: currentRoute().visit, slot: currentRoute().slot }),
   next: () => visits.goToNextSlot(currentRoute().slot),
-  keepThis: () => visits.keepPoor(currentShot(get())?.id, currentRoute().slot),
+  keepThis: () => visits.keepPoor(currentCapture(get())?.id, currentRoute().slot),
   useThis: () => visits.useInSlot(currentRoute().slot, currentRoute().capture),
   ask: () => set({ asking: "reason" }),
   stopAsking: () => set({ asking: "" }),
-  couldNot: (slot, reason) => visits.couldNot(slot, reason),
+  notPossible: (slot, reason) => visits.notPossible(slot, reason),
   finish: () => visits.finish(),
   finishWithout: () => visits.finish({ isSure: true }),
   takeMissing() {
@@ -192,17 +192,17 @@ const alertButtons = {
   },
   next: () => examActions.next(),
   again: () => examActions.again(),
-  couldNot: () => examActions.ask(),
+  notPossible: () => examActions.ask(),
   timer: () => set({ timer: Date.now() + PUPIL_REST_MS, now: Date.now() }),
   change({ id, slot }) {
     lowerAlert("eye.side");
-    visits.moveToOtherEye(slot ?? currentRoute().slot, id ?? currentShot(get())?.id);
+    visits.moveToOtherEye(slot ?? currentRoute().slot, id ?? currentCapture(get())?.id);
   },
   keepEye({ code, id, slot }) {
     dismissAlert({ code }); // hide the question until the server has the answer
-    visits.confirmEye(slot ?? currentRoute().slot, id ?? currentShot(get())?.id);
+    visits.confirmEye(slot ?? currentRoute().slot, id ?? currentCapture(get())?.id);
   },
-  uncross: visits.undoCouldNot,
+  uncross: visits.undoNotPossible,
 };
 
 const settingsActions = {

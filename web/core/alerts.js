@@ -3,7 +3,7 @@
 // as a chip.
 
 import { sentences } from "./api.js";
-import { consentOf, get, lostShots, set } from "./state.js";
+import { consentOf, get, lostCaptures, set } from "./state.js";
 import { calendarDay, has, t } from "../i18n/translate.js";
 
 /** @typedef {import("../core/state.js").State} State */
@@ -11,7 +11,7 @@ import { calendarDay, has, t } from "../i18n/translate.js";
 const ASSERTIVE = /^(link\.lost|light\.|heat\.)/;
 
 // Highest priority first. Levels: `stop` blocks captures; `refused` is the reason of a refused request, in the prompt
-// bar where nothing blocks; `tell` is an advisory chip; `shot` belongs to one picture and is shown on its card; `ask` is
+// bar where nothing blocks; `tell` is an advisory chip; `picture` belongs to one picture and is shown on its card; `ask` is
 // a question on that card. `wait_s`: seconds until the alert ends by itself; "n": the n minutes that the server sent. A
 // `wait_s` from the server takes precedence.
 /** @type {[string, string, string[], {wait_s?: number | "n"}?][]} */
@@ -44,16 +44,16 @@ const TABLE = [
   ["send.waiting", "tell", ["see"]],
   ["cal.old", "tell", ["later"]],
   ["eye.side", "ask", ["change", "keepEye"]],
-  ["make.failed", "shot", ["again", "next"]],
-  ["shot.poor", "shot", ["couldNot", "again"]],
-  ["shot.pupil", "shot", ["timer", "again"]],
-  ["shot.saturated", "shot", ["again"]],
-  ["shot.dark", "shot", ["again"]],
-  ["shot.moved", "shot", ["again"]],
-  ["shot.blink", "shot", ["again"]],
-  ["shot.noeye", "shot", ["again"]],
-  ["shot.edge", "shot", ["again"]],
-  ["shot.halo", "shot", ["again"]],
+  ["make.failed", "picture", ["again", "next"]],
+  ["shot.poor", "picture", ["notPossible", "again"]],
+  ["shot.pupil", "picture", ["timer", "again"]],
+  ["shot.saturated", "picture", ["again"]],
+  ["shot.dark", "picture", ["again"]],
+  ["shot.moved", "picture", ["again"]],
+  ["shot.blink", "picture", ["again"]],
+  ["shot.noeye", "picture", ["again"]],
+  ["shot.edge", "picture", ["again"]],
+  ["shot.halo", "picture", ["again"]],
 ];
 
 export const ALERTS = Object.freeze(
@@ -174,7 +174,7 @@ function consentAlerts({ route, visit }) {
  */
 export function visibleAlerts(state) {
   const { alerts } = state;
-  const lost = lostShots(state).map((shot) => ({ ...shot, ...ALERTS["shot.lost"], assertive: true, from: "page", until: 0 }));
+  const lost = lostCaptures(state).map((capture) => ({ ...capture, ...ALERTS["shot.lost"], assertive: true, from: "page", until: 0 }));
   return {
     stop: [...consentAlerts(state), ...alerts].sort(worstFirst).find(({ level }) => level === "stop") ?? null,
     chips: [...lost, ...alerts.filter(({ level }) => level === "tell").slice(0, 2)],

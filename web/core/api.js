@@ -61,7 +61,7 @@ export const getMontage = (visit, eye) => requestJson(montageUrl(visit, eye));
 export const montagePictureUrl = (visit, eye, digest) => `${montageUrl(visit, eye)}/picture.png?${digest}`;
 export const getVisits = (query) => requestJson(`/api/visits?${new URLSearchParams(query)}`);
 export const getCapture = (id) => requestJson(`/api/captures/${encodeURIComponent(id)}`);
-export const getOutbox = () => requestJson("/api/outbox");
+export const getUploadQueue = () => requestJson("/api/upload-queue");
 export const getFolders = async () => (await requestJson("/api/exports")).folders;
 export const REMOVED = 410; // status of the file of a capture that was removed after a copy was made or sent
 
@@ -143,7 +143,7 @@ function parseAim(header) {
 
 /**
  * Return the URLs of the pictures of a capture: of the version with this number, or as taken for 0.
- * @param {import("./state.js").Capture} capture
+ * @param {import("./state.js").CaptureRecord} capture
  * @param {number} version
  * @returns {Record<string, string>}
  */
@@ -152,7 +152,7 @@ export const pictureLinks = ({ links, versions = [] }, version) => versions.find
 /**
  * Return the URL of the picture in colour of a capture or one of its versions. Pictures as taken are shown in colour in
  * all of a visit or in none: undefined where the server names a reason against it.
- * @param {import("./state.js").Capture} capture
+ * @param {import("./state.js").CaptureRecord} capture
  * @param {number} version
  * @param {import("./state.js").Visit | null} visit
  */

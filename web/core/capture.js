@@ -1,16 +1,16 @@
 // Captures from press to kept picture: requests, progress events, verdicts and lost answers.
-// A shot: {key, visit, slot, eye, id, stage, verdict, quick, capture, over}; `key` is the idempotency key, `id` the
-// server's.
+// A capture: {key, visit, slot, eye, id, stage, verdict, quick, record, over}; `key` is the idempotency key, `id` the
+// server's, `record` what the server stored.
 
 import { newIdempotencyKey, getCapture, ApiError, send } from "./api.js";
-import { allowsLight, eyeOf, PICTURE_DEFAULTS, get, set, currentShot } from "./state.js";
+import { allowsLight, eyeOf, PICTURE_DEFAULTS, get, set, currentCapture } from "./state.js";
 import { navigate } from "./router.js";
 import { buttonsChanged } from "./taps.js";
 import { lowerAlerts, raiseAlert, raiseRefusal, visibleAlerts } from "./alerts.js";
 import { alertOnError, refreshVisit } from "./visit.js";
 import { t } from "../i18n/translate.js";
 
-const SHOTS_MAX = 12;
+const CAPTURES_MAX = 12;
 const FIRST_STAGE = Object.freeze({ name: "expose", fraction: 0, left: 0 });
 
 const finishedIds = new Set(); // finished captures; their late events are ignored
@@ -24,10 +24,10 @@ export function playCue(name) {
   if (get().sound) import("./sound.js").then(({ play }) => play(name), () => {}); // without a connection there is no tone; the text is shown
 }
 
-const setShots = (shots) => set({ shots: Object.freeze(shots.slice(-SHOTS_MAX)) });
-const updateShot = (key, patch) =>
-  setShots(get().shots.map((shot) => (shot.key === key ? Object.freeze({ ...shot, ...patch }) : shot)));
-const shotById = (id) => get().shots.find((shot) => shot.id === id);
+const setCaptures = (captures) => set({ captures: Object.freeze(captures.slice(-CAPTURES_MAX)) });
+const updateCapture = (key, patch) =>
+  setCaptures(get().captures.map((capture) => (capture.key === key ? Object.freeze({ ...capture, ...patch }) : capture)));
+const captureById = (id) => get().captures.find((capture) => capture.id === id);
 
 /** Take a picture of the current slot, unless an alert or a missing consent blocks it. */
 export function takePicture() {
@@ -49,59 +49,59 @@ function showPendingNote() {
 async function submitCapture(visit, slot) {
   const eye = eyeOf(get(), slot);
   const key = newIdempotencyKey();
-  for (const { id, over } of get().shots) if (id && over) finishedIds.add(id);
+  for (const { id, over } of get().captures) if (id && over) finishedIds.add(id);
   lowerAlerts(({ from }) => from === "press");
-  setShots([...get().shots, Object.freeze({ key, visit, slot, eye, id: null, stage: FIRST_STAGE, verdict: null, over: false })]);
+  setCaptures([...get().captures, Object.freeze({ key, visit, slot, eye, id: null, stage: FIRST_STAGE, verdict: null, over: false })]);
   navigate({ screen: "picture", visit, slot });
   playCue("taken");
   try {
-    completeShot(await send("POST", "/api/captures", { eye, key, visit, slot }), key);
+    completeCapture(await send("POST", "/api/captures", { eye, key, visit, slot }), key);
   } catch (problem) {
     if (!(problem instanceof ApiError)) throw problem;
-    failShot(key, problem);
+    failCapture(key, problem);
   }
 }
 
 // A failed capture that the server had begun is reported, because a good verdict may have been shown.
-function failShot(key, problem) {
+function failCapture(key, problem) {
   const { code, message, remedy } = problem;
-  const shot = get().shots.find((one) => one.key === key);
-  if (!shot || shot.over) return;
-  const here = currentShot(get())?.key === key;
-  if (shot.id && code === "link.cut") {
-    updateShot(key, { answerLost: true }); // perhaps the server kept it; queried when the connection is back
+  const capture = get().captures.find((one) => one.key === key);
+  if (!capture || capture.over) return;
+  const here = currentCapture(get())?.key === key;
+  if (capture.id && code === "link.cut") {
+    updateCapture(key, { answerLost: true }); // perhaps the server kept it; queried when the connection is back
   } else {
-    if (shot.id) updateShot(key, { over: true, failed: { code, message, remedy } });
-    else setShots(get().shots.filter((one) => one.key !== key));
-    if (here) navigate({ screen: "aim", visit: shot.visit, slot: shot.slot }, { replace: true });
+    if (capture.id) updateCapture(key, { over: true, failed: { code, message, remedy } });
+    else setCaptures(get().captures.filter((one) => one.key !== key));
+    if (here) navigate({ screen: "aim", visit: capture.visit, slot: capture.slot }, { replace: true });
   }
-  if (here || !shot.id) raiseRefusal(problem); // on other screens the chip of the lost picture is shown
-  refreshVisit(shot.visit);
+  if (here || !capture.id) raiseRefusal(problem); // on other screens the chip of the lost picture is shown
+  refreshVisit(capture.visit);
 }
 
 /** After a reconnection, fetch the result of each capture whose answer was lost. */
-export async function resolveCutShots() {
-  for (const { id, key, answerLost, over } of get().shots) {
+export async function resolveCutCaptures() {
+  for (const { id, key, answerLost, over } of get().captures) {
     if (!id || !answerLost || over) continue;
     try {
-      completeShot(await getCapture(id), key);
+      completeCapture(await getCapture(id), key);
     } catch (problem) {
       if (!(problem instanceof ApiError)) throw problem;
       const pending = problem.code === "link.cut" || ["making", "busy"].includes(get().activity);
-      if (!pending) failShot(key, { ...problem, message: t("lost"), remedy: t("lost.remedy") });
+      if (!pending) failCapture(key, { ...problem, message: t("lost"), remedy: t("lost.remedy") });
     }
   }
 }
 
-function completeShot(capture, key = shotById(capture.id)?.key) {
-  finishedIds.add(capture.id);
-  const shot = get().shots.find((one) => one.key === key);
-  if (!shot || shot.capture) return;
-  const verdict = capture.verdict ?? shot.verdict;
-  if (verdict?.word !== "good" || shot.verdict?.word !== "good") buttonsChanged();
-  updateShot(key, { id: capture.id, capture: Object.freeze(capture), verdict, over: true, stage: { ...shot.stage, fraction: 1 } });
-  updateSlot(shot, capture.id, verdict);
-  refreshVisit(shot.visit);
+function completeCapture(record, key = captureById(record.id)?.key) {
+  finishedIds.add(record.id);
+  const capture = get().captures.find((one) => one.key === key);
+  if (!capture || capture.record) return;
+  const verdict = record.verdict ?? capture.verdict;
+  if (verdict?.word !== "good" || capture.verdict?.word !== "good") buttonsChanged();
+  updateCapture(key, { id: record.id, record: Object.freeze(record), verdict, over: true, stage: { ...capture.stage, fraction: 1 } });
+  updateSlot(capture, record.id, verdict);
+  refreshVisit(capture.visit);
 }
 
 // Optimistic update: show the picture in its tile until the visit is loaded.
@@ -120,11 +120,11 @@ export const captureEventHandlers = {
     if (finishedIds.has(id)) return;
     // Match by key, or by visit and slot after a reload, so that another screen's capture is not matched.
     const matches = (one) => one.key === key || (one.reloaded && one.visit === visit && one.slot === slot);
-    const shot = shotById(id) ?? get().shots.find((one) => !one.id && !one.over && matches(one));
-    if (!shot || shot.over) return;
+    const capture = captureById(id) ?? get().captures.find((one) => !one.id && !one.over && matches(one));
+    if (!capture || capture.over) return;
     // The progress bar never moves backwards.
-    const stage = { name, fraction: Math.max(shot.stage.fraction, fraction ?? 0), left: left ?? 0 };
-    updateShot(shot.key, { id, stage, quick: url ?? shot.quick });
+    const stage = { name, fraction: Math.max(capture.stage.fraction, fraction ?? 0), left: left ?? 0 };
+    updateCapture(capture.key, { id, stage, quick: url ?? capture.quick });
   },
 
   /**
@@ -132,42 +132,42 @@ export const captureEventHandlers = {
    * changes it.
    */
   verdict({ id, ...verdict }) {
-    const shot = shotById(id);
-    if (!shot || shot.over) return;
-    updateShot(shot.key, { verdict: Object.freeze(verdict) });
-    if (shot.verdict?.word === verdict.word) return;
+    const capture = captureById(id);
+    if (!capture || capture.over) return;
+    updateCapture(capture.key, { verdict: Object.freeze(verdict) });
+    if (capture.verdict?.word === verdict.word) return;
     buttonsChanged();
     playCue(verdict.word === "again" ? "poor" : "good");
   },
 
-  kept(capture) {
-    const shot =
-      shotById(capture.id) ?? get().shots.find(({ id, over, visit, slot }) => !id && !over && visit === capture.visit && slot === capture.slot);
-    if (shot) completeShot(capture, shot.key);
-    else if (capture.visit && capture.visit === get().visit?.id) refreshVisit(capture.visit);
+  kept(record) {
+    const capture =
+      captureById(record.id) ?? get().captures.find(({ id, over, visit, slot }) => !id && !over && visit === record.visit && slot === record.slot);
+    if (capture) completeCapture(record, capture.key);
+    else if (record.visit && record.visit === get().visit?.id) refreshVisit(record.visit);
   },
 
   /** The page that pressed gets the error as the answer to its request; a reloaded page gets it from this event. */
   failed({ id, code, message, remedy }) {
-    const shot = shotById(id);
-    if (shot?.reloaded && !shot.over) updateShot(shot.key, { over: true, failed: { code, message, remedy } });
+    const capture = captureById(id);
+    if (capture?.reloaded && !capture.over) updateCapture(capture.key, { over: true, failed: { code, message, remedy } });
   },
 };
 
 /** Show an earlier picture (after a reload or from a tile); without one, go to aiming. */
 export async function openPicture(route) {
-  if (currentShot(get())) return;
+  if (currentCapture(get())) return;
   const { visit } = get();
   const slot = visit?.slots[route.slot];
   const id = route.capture ?? slot?.capture ?? slot?.captures?.at(-1);
   if (id) {
-    const capture = await alertOnError(() => getCapture(id));
-    if (capture && capture.visit !== route.visit) rejectForeignCapture(route, capture);
-    else if (capture) setShots([...get().shots, shotFrom(capture, route)]);
+    const record = await alertOnError(() => getCapture(id));
+    if (record && record.visit !== route.visit) rejectForeignCapture(route, record);
+    else if (record) setCaptures([...get().captures, captureFrom(record, route)]);
   } else if (["making", "busy"].includes(get().activity)) {
     const eye = eyeOf(get(), route.slot);
-    const shot = { key: newIdempotencyKey(), ...route, eye, id: null, stage: FIRST_STAGE, verdict: null, reloaded: true };
-    setShots([...get().shots, Object.freeze(shot)]);
+    const capture = { key: newIdempotencyKey(), ...route, eye, id: null, stage: FIRST_STAGE, verdict: null, reloaded: true };
+    setCaptures([...get().captures, Object.freeze(capture)]);
   } else {
     navigate({ screen: "aim", visit: route.visit, slot: route.slot }, { replace: true });
   }
@@ -179,10 +179,10 @@ export function rejectForeignCapture({ visit }, { test }) {
   raiseAlert({ code: "capture.elsewhere", message: t(test ? "fault.test" : "fault.elsewhere"), remedy: "", from: "press" });
 }
 
-function shotFrom(capture, { visit, slot }) {
-  finishedIds.add(capture.id);
-  const { id, eye } = capture;
-  return Object.freeze({ key: id, visit, slot, eye, id, stage: FIRST_STAGE, verdict: capture.verdict ?? null, capture, over: true });
+function captureFrom(record, { visit, slot }) {
+  finishedIds.add(record.id);
+  const { id, eye } = record;
+  return Object.freeze({ key: id, visit, slot, eye, id, stage: FIRST_STAGE, verdict: record.verdict ?? null, record, over: true });
 }
 
 /** Reset the image tools for another picture. */

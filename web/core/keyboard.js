@@ -1,7 +1,7 @@
 // Keyboard input from a keyboard, a Bluetooth shutter or a barcode reader. Single-letter keys can be disabled (WCAG
 // 2.1.4).
 
-import { get, currentShot } from "./state.js";
+import { get, currentCapture } from "./state.js";
 import { acceptKey } from "./taps.js";
 
 const SHUTTER_KEYS = new Set([" ", "Enter", "AudioVolumeUp"]);
@@ -37,8 +37,8 @@ function onFind({ key, target }, actions) {
 function onLetter(event, actions) {
   const { key } = event;
   const { route, redfree, loupe, protocol } = get();
-  const shot = currentShot(get());
-  const hasVerdict = route.screen === "picture" && shot && (shot.over || shot.verdict);
+  const capture = currentCapture(get());
+  const hasVerdict = route.screen === "picture" && capture && (capture.over || capture.verdict);
   const once = (action) => acceptKey(event) && action();
   const keys = {
     ArrowLeft: () => route.screen !== "home" && once(actions.back),

@@ -56,20 +56,20 @@ const settings = Object.freeze({
  *   next_slot: string | null, no_colour: string | null, outcome: {code: string, sentence: string} | null,
  *   finished_at: string | null, day: string, undo_until: string | null, waiting?: string[]}} Visit
  * @typedef {{id: string, visit: string | null, slot: string | null, eye: string, taken_at: string, verdict: Verdict | null,
- *   simulated: boolean, report: any, links: Record<string, string>, versions?: any[], calibration_id: string, test: boolean}} Capture
+ *   simulated: boolean, report: any, links: Record<string, string>, versions?: any[], calibration_id: string, test: boolean}} CaptureRecord
  * @typedef {{key: string, visit: string, slot: string, eye: string, id: string | null,
  *   stage: {name: string, fraction: number, left: number}, verdict: Verdict | null, over?: boolean, quick?: string,
- *   capture?: Capture, failed?: {code: string, message: string, remedy: string}, answerLost?: boolean, reloaded?: boolean}} Shot
+ *   record?: CaptureRecord, failed?: {code: string, message: string, remedy: string}, answerLost?: boolean, reloaded?: boolean}} Capture
  * @typedef {{code: string, level: string, rank: number, buttons: string[], from: string, until: number, [more: string]: any}} Alert
  * @typedef {{id: string, eye: string, field: string, required: boolean}} SlotPlan
  * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, programme: Record<string, any>}} Protocol
  * @typedef {{link: string, status: any, activity: string, hasControl: boolean, alerts: readonly Alert[],
  *   route: import("./router.js").Route, protocol: Protocol | null, visit: Visit | null, visits: Visit[] | null,
  *   counts: {done: number, to_finish: number, referred: number, declined: number} | null, typed: string, listFilter: string,
- *   shots: readonly Shot[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
+ *   captures: readonly Capture[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
  *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: string, zoom: number, note: string,
- *   picked: readonly string[], compared: readonly Capture[], montages: Readonly<Record<string, any>>,
- *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, outbox: any,
+ *   picked: readonly string[], compared: readonly CaptureRecord[], montages: Readonly<Record<string, any>>,
+ *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, uploadQueue: any,
  *   finishing: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
  *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
  *   blink: boolean, front: number, qrCode: {size: number, path: string} | null, noticeCount: number,
@@ -89,7 +89,7 @@ export const store = createStore(/** @type {State} */ ({
   counts: null,
   typed: "", // digits of the number pad
   listFilter: "all", // all | open | referred
-  shots: Object.freeze([]), // captures in progress and viewed captures, see capture.js
+  captures: Object.freeze([]), // captures in progress and viewed captures, see capture.js
   prompt: null, // current aiming hint
   ...PICTURE_DEFAULTS,
   zoom: 1,
@@ -100,7 +100,7 @@ export const store = createStore(/** @type {State} */ ({
   folders: null, // USB drives for a copy
   zipped: false, // the browser was asked to save a ZIP file
   copied: null,
-  outbox: null, // upload queue, for the Send screen
+  uploadQueue: null, // upload queue, for the Send screen
   finishing: null, // visit to finish after its last capture
   now: 0, // updated every second during a countdown
   modules: Object.freeze({}), // lazily loaded modules, by name
@@ -117,46 +117,46 @@ export const store = createStore(/** @type {State} */ ({
 export const { get, set } = store;
 
 /**
- * Return the shot on the picture screen: the named capture, or the newest of the slot.
+ * Return the capture on the picture screen: the named capture, or the newest of the slot.
  * @param {State} state
  */
-export function currentShot({ route, shots }) {
+export function currentCapture({ route, captures }) {
   if (route.screen !== "picture") return null;
-  const here = shots.filter((shot) => shot.visit === route.visit && shot.slot === route.slot);
-  if (route.capture) return here.find((shot) => shot.id === route.capture) ?? null;
-  return here.findLast((shot) => !shot.failed) ?? here.at(-1) ?? null;
+  const here = captures.filter((capture) => capture.visit === route.visit && capture.slot === route.slot);
+  if (route.capture) return here.find((capture) => capture.id === route.capture) ?? null;
+  return here.findLast((capture) => !capture.failed) ?? here.at(-1) ?? null;
 }
 
 /**
- * Return the shots of a visit that are still in progress.
+ * Return the captures of a visit that are still in progress.
  * @param {State} state
  * @param {string} visit
  */
-export const pendingShots = ({ shots }, visit) => shots.filter((shot) => shot.visit === visit && !shot.over);
+export const pendingCaptures = ({ captures }, visit) => captures.filter((capture) => capture.visit === visit && !capture.over);
 
-/** Move a shot to a slot of the other eye. */
-export const moveShot = (id, { id: slot, eye }) =>
-  set({ shots: Object.freeze(get().shots.map((shot) => (shot.id === id ? Object.freeze({ ...shot, slot, eye }) : shot))) });
+/** Move a capture to a slot of the other eye. */
+export const moveCapture = (id, { id: slot, eye }) =>
+  set({ captures: Object.freeze(get().captures.map((capture) => (capture.id === id ? Object.freeze({ ...capture, slot, eye }) : capture))) });
 
 /**
  * Return the number of required slots of the visit that have neither a picture, nor one in progress, nor a reason.
  * @param {State} state
  */
-export const missingPictures = ({ visit, protocol, shots }) =>
+export const missingPictures = ({ visit, protocol, captures }) =>
   (protocol?.slots ?? []).filter(
     ({ id, required }) =>
-      required && visit?.slots[id]?.state === "empty" && !shots.some((shot) => shot.visit === visit.id && shot.slot === id && !shot.over),
+      required && visit?.slots[id]?.state === "empty" && !captures.some((capture) => capture.visit === visit.id && capture.slot === id && !capture.over),
   ).length;
 
 /**
- * Return the failed shots of the open visit, each until its slot gets another shot or is marked "could not".
+ * Return the failed captures of the open visit, each until its slot gets another capture or is marked "could not".
  * @param {State} state
  */
-export function lostShots({ shots, visit }) {
+export function lostCaptures({ captures, visit }) {
   if (!visit || visit.finished_at) return [];
-  const of = ({ slot }) => shots.filter((shot) => shot.visit === visit.id && shot.slot === slot);
-  return shots.filter(
-    (shot) => shot.failed && of(shot).at(-1) === shot && visit.slots[shot.slot]?.state !== "could_not",
+  const of = ({ slot }) => captures.filter((capture) => capture.visit === visit.id && capture.slot === slot);
+  return captures.filter(
+    (capture) => capture.failed && of(capture).at(-1) === capture && visit.slots[capture.slot]?.state !== "not_possible",
   );
 }
 

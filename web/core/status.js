@@ -2,7 +2,7 @@
 
 import { requestControl, getStatus, releaseControl, ApiError } from "./api.js";
 import { lowerAlert, lowerAlerts, raiseAlert, syncNotices } from "./alerts.js";
-import { resolveCutShots } from "./capture.js";
+import { resolveCutCaptures } from "./capture.js";
 import { get, set } from "./state.js";
 import { t } from "../i18n/translate.js";
 
@@ -27,7 +27,7 @@ export async function refreshStatus() {
   lowerAlerts(({ from, problemCode }) => from === "status" && problemCode !== problem?.code);
   if (problem && !UNSHOWN_PROBLEMS.includes(problem.code)) raiseAlert({ ...problem, problemCode: problem.code, from: "status" });
   if (get().noticeCount === noticeCount) syncNotices(status.standing ?? []); // otherwise `status.standing` is older than the latest notice event
-  resolveCutShots();
+  resolveCutCaptures();
   raiseFindings(status.notices ?? []);
   if (status.swept?.length && !get().interruptedShown) raiseInterrupted(status.swept);
   await renewControl();
@@ -57,7 +57,7 @@ const READING = ["outcome", "pictures", "compare", "history", "send"];
  * Return whether this page needs the control lease: it aims, or a picture of its own is being taken.
  * @param {State} state
  */
-const needsControl = ({ route, shots }) => route.screen === "aim" || shots.some((shot) => !shot.over && !shot.reloaded);
+const needsControl = ({ route, captures }) => route.screen === "aim" || captures.some((capture) => !capture.over && !capture.reloaded);
 
 /** @param {State} state */
 const isReading = ({ route, visit }) => READING.includes(route.screen) || (route.screen === "picture" && Boolean(visit?.finished_at));

@@ -1,8 +1,8 @@
 // Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
 
 import { today } from "../i18n/translate.js";
-import { newIdempotencyKey, getMontage, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
-import { eyeOf, get, lostShots, missingPictures, otherEyeSlot, moveShot, set, pendingShots } from "./state.js";
+import { newIdempotencyKey, getMontage, getUploadQueue, getVisit, getVisits, ApiError, send } from "./api.js";
+import { eyeOf, get, lostCaptures, missingPictures, otherEyeSlot, moveCapture, set, pendingCaptures } from "./state.js";
 import { navigate } from "./router.js";
 import { lowerAlert, raiseAlert, raiseRefusal } from "./alerts.js";
 
@@ -133,19 +133,19 @@ const change = (what, body) =>
   alertOnError(async () => storeVisit(await send("POST", visitUrl(get().route.visit, what), body)));
 
 /** Mark a slot as "could not"; a chip offers undo for ten seconds. */
-export async function couldNot(slot, reason) {
+export async function notPossible(slot, reason) {
   set({ asking: "" });
   const { visit } = get();
   if (!visit) return;
   const before = visit.slots[slot].capture;
-  if (!(await change("could-not", { slot, reason }))) return;
+  if (!(await change("not-possible", { slot, reason }))) return;
   navigate({ screen: "aim", visit: visit.id, slot: nextSlot(slot) ?? slot });
   lowerAlert("shot.crossed");
   raiseAlert({ code: "shot.crossed", visit: visit.id, slot, eye: eyeOf(get(), slot), before, from: "page" });
 }
 
 /** Undo "could not". */
-export async function undoCouldNot({ visit, slot, before }) {
+export async function undoNotPossible({ visit, slot, before }) {
   lowerAlert("shot.crossed");
   const result = await alertOnError(() => send("POST", visitUrl(visit, "slots"), { slot, capture: before }));
   if (!result) return;
@@ -155,7 +155,7 @@ export async function undoCouldNot({ visit, slot, before }) {
 
 /** Accept a poor picture for its slot and go to the next slot. */
 export async function keepPoor(capture, slot) {
-  const kept = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/keep`));
+  const kept = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/accept`));
   if (!kept) return;
   await refreshVisit(get().route.visit);
   goToNextSlot(slot);
@@ -171,7 +171,7 @@ export async function moveToOtherEye(slot, capture) {
   const visit = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: to.eye }));
   if (!visit) return;
   storeVisit(visit);
-  moveShot(capture, to);
+  moveCapture(capture, to);
   navigate({ screen: "picture", visit: visit.id, slot: to.id, capture });
 }
 
@@ -185,7 +185,7 @@ export function nextSlot(after) {
   if (!visit || !protocol) return null;
   const ids = protocol.slots.map(({ id }) => id);
   const order = [...ids.slice(ids.indexOf(after) + 1), ...ids.slice(0, ids.indexOf(after))];
-  const making = pendingShots(get(), visit.id).map(({ slot }) => slot);
+  const making = pendingCaptures(get(), visit.id).map(({ slot }) => slot);
   const missing = order.filter((id) => id !== after && visit.slots[id]?.state === "empty" && !making.includes(id));
   return missing[0] ?? null;
 }
@@ -199,15 +199,15 @@ export function goToNextSlot(after) {
 
 // ---- upload queue
 
-export async function refreshOutbox() {
-  const outbox = await alertOnError(getOutbox);
-  if (outbox) set({ outbox });
+export async function refreshUploadQueue() {
+  const uploadQueue = await alertOnError(getUploadQueue);
+  if (uploadQueue) set({ uploadQueue });
 }
 
 /** Retry the uploads of one visit, or of all, at once. */
 export async function retryUploads(visit) {
-  const outbox = await alertOnError(() => send("POST", "/api/outbox/try", visit ? { visit } : {}));
-  if (outbox) set({ outbox });
+  const uploadQueue = await alertOnError(() => send("POST", "/api/upload-queue/retry", visit ? { visit } : {}));
+  if (uploadQueue) set({ uploadQueue });
 }
 
 // ---- finishing
@@ -221,7 +221,7 @@ export async function finish({ isSure = false } = {}) {
   if (!visit) return;
   if (!isSure && missingPictures(get()) && get().visit?.fields.consent !== "declined") return set({ asking: "finish" });
   lowerAlert("shot.crossed"); // undo would need a reopened visit
-  if (pendingShots(get(), visit).length) {
+  if (pendingCaptures(get(), visit).length) {
     navigate({ screen: "outcome", visit });
     set({ finishing: visit });
     return;
@@ -232,10 +232,10 @@ export async function finish({ isSure = false } = {}) {
 /** Finish a waiting visit after its last capture; if a capture was lost, go to its slot instead. */
 export function finishWhenComplete() {
   const { finishing, route, visit } = get();
-  if (!finishing || visit?.id !== finishing || pendingShots(get(), finishing).length) return;
+  if (!finishing || visit?.id !== finishing || pendingCaptures(get(), finishing).length) return;
   set({ finishing: null });
   if (route.visit !== finishing || route.screen !== "outcome") return;
-  const [lost] = lostShots(get());
+  const [lost] = lostCaptures(get());
   if (lost) navigate({ screen: "aim", visit: finishing, slot: lost.slot }, { replace: true });
   else finish({ isSure: true });
 }

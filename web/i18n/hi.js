@@ -123,7 +123,7 @@ export const WORDS = {
   "tile.empty": "अभी नहीं ली",
   "tile.good": "अच्छी",
   "tile.poor": "फिर से लें",
-  "tile.could_not": "नहीं हो सकी",
+  "tile.not_possible": "नहीं हो सकी",
   "tile.lost": "खो गई: फिर से लें",
   "tile.making": "बन रही है",
 
@@ -152,7 +152,7 @@ export const WORDS = {
   "result.finish": "पूरा करें",
   "result.keep": "यही रखें",
   "result.use": "इसे चुनें",
-  "result.couldnot": "नहीं हो सकी",
+  "result.notpossible": "नहीं हो सकी",
   "result.othereye": "{other} आँख में बदलें",
   "result.seen": "नतीजे पर वापस",
   "result.why": "तस्वीर क्यों नहीं हो सकी?",

@@ -130,7 +130,7 @@ export const WORDS = {
   "tile.empty": "இன்னும் எடுக்கவில்லை",
   "tile.good": "நன்று",
   "tile.poor": "மீண்டும் எடுக்கவும்",
-  "tile.could_not": "முடியவில்லை",
+  "tile.not_possible": "முடியவில்லை",
   "tile.lost": "தொலைந்தது: மீண்டும் எடு",
   "tile.making": "உருவாகிறது",
 
@@ -161,7 +161,7 @@ export const WORDS = {
   "result.finish": "முடிக்கவும்",
   "result.keep": "இதையே வைக்கவும்",
   "result.use": "இதைப் பயன்படுத்து",
-  "result.couldnot": "முடியவில்லை",
+  "result.notpossible": "முடியவில்லை",
   "result.othereye": "{other} கண்ணுக்கு மாற்றவும்",
   "result.seen": "முடிவுக்குத் திரும்பு",
   "result.why": "ஏன் எடுக்க முடியவில்லை?",

@@ -123,7 +123,7 @@ export const WORDS = {
   "tile.empty": "ఇంకా తీయలేదు",
   "tile.good": "బాగుంది",
   "tile.poor": "మళ్ళీ తీయండి",
-  "tile.could_not": "కుదరలేదు",
+  "tile.not_possible": "కుదరలేదు",
   "tile.lost": "పోయింది: మళ్ళీ తీయండి",
   "tile.making": "తయారవుతోంది",
 
@@ -152,7 +152,7 @@ export const WORDS = {
   "result.finish": "ముగించండి",
   "result.keep": "ఇదే ఉంచండి",
   "result.use": "ఇది వాడండి",
-  "result.couldnot": "కుదరలేదు",
+  "result.notpossible": "కుదరలేదు",
   "result.othereye": "{other} కంటికి మార్చండి",
   "result.seen": "ఫలితానికి తిరిగి",
   "result.why": "ఎందుకు తీయలేకపోయారు?",

@@ -23,9 +23,9 @@ export function aim(state, actions) {
       ${here?.capture
         ? html`<button class="quiet" type="button" id="keep-old" @click=${actions.keepPrevious}>${icon("check")} ${t("aim.keep")}</button>`
         : nothing}
-      ${here?.state === "could_not"
+      ${here?.state === "not_possible"
         ? nothing
-        : html`<button class="quiet" type="button" id="could-not" @click=${actions.ask}>${icon("cross")} ${t("result.couldnot")}</button>`}
+        : html`<button class="quiet" type="button" id="not-possible" @click=${actions.ask}>${icon("cross")} ${t("result.notpossible")}</button>`}
       <button class=${answered ? "primary" : "quiet"} type="button" id="finish" @click=${actions.finish}>
         ${t(answered ? "result.finish" : "finish.now")}
       </button>

@@ -3,7 +3,7 @@
 
 import { outcomeIcon } from "./home.js";
 import { icon } from "../components/icons.js";
-import { pendingShots } from "../core/state.js";
+import { pendingCaptures } from "../core/state.js";
 import { patientLabel, slotLabel, tiles } from "../components/components.js";
 import { displayNumber } from "../core/numbers.js";
 import { html, nothing, svg } from "../vendor/lit-html.js";
@@ -52,10 +52,10 @@ export const reopenButton = ({ undo_until: allowed }, actions) =>
  * @param {State} state
  */
 function pendingPictures(visit, state, actions) {
-  const shots = pendingShots(state, visit.id);
+  const captures = pendingCaptures(state, visit.id);
   return html`<section class="outcome" id="finishing">
-    <h2>${icon("wait")} ${t("outcome.making", { n: Math.max(1, shots.length) })}</h2>
-    ${shots.map(
+    <h2>${icon("wait")} ${t("outcome.making", { n: Math.max(1, captures.length) })}</h2>
+    ${captures.map(
       ({ slot, stage }) => html`<label class="making">
         ${slotLabel(state, slot).eye} · ${slotLabel(state, slot).part}
         <progress max="1" .value=${stage.fraction}></progress>

@@ -3,7 +3,7 @@
 // Types).
 
 import { icon } from "../components/icons.js";
-import { currentShot } from "../core/state.js";
+import { currentCapture } from "../core/state.js";
 import { chips, patientLabel, standing } from "../components/components.js";
 import { aim } from "./aim.js";
 import { find, home } from "./home.js";
@@ -49,9 +49,9 @@ export function page(state, actions) {
  * @param {State} state
  */
 function phase(state) {
-  const shot = currentShot(state);
-  if (!shot) return "";
-  return shot.over ? "kept" : shot.verdict ? "assessed" : "making";
+  const capture = currentCapture(state);
+  if (!capture) return "";
+  return capture.over ? "kept" : capture.verdict ? "assessed" : "making";
 }
 
 // ---- header
@@ -72,7 +72,7 @@ function header(state, actions) {
         <span class="state" data-state=${word}>${t(has(`doing.${word}`) ? `doing.${word}` : "doing.busy")}</span>
         ${space === undefined || space === null ? nothing : html`<span class="space">${spaceText(space)}</span>`}
       </p>
-      ${kindChip(currentShot(state)?.capture?.simulated ? "simulated" : status?.kind)}
+      ${kindChip(currentCapture(state)?.record?.simulated ? "simulated" : status?.kind)}
       <button class="quiet" type="button" id="open-menu" @click=${actions.openMenu}>${icon("menu")} ${t("menu")}</button>
     </header>
   `;
@@ -83,9 +83,9 @@ const spaceText = (patients) => t(patients > SPACE_PLENTY ? "space.plenty" : "sp
 
 // When every capture in progress has a verdict, the patient need not hold still, so "making" is shown instead of
 // "busy".
-function shownActivity({ activity, shots }) {
-  const own = shots.filter((shot) => !shot.over);
-  return activity === "busy" && own.length && own.every((shot) => shot.verdict) ? "making" : activity;
+function shownActivity({ activity, captures }) {
+  const own = captures.filter((capture) => !capture.over);
+  return activity === "busy" && own.length && own.every((capture) => capture.verdict) ? "making" : activity;
 }
 
 function title(route, visit, actions) {

@@ -3,7 +3,7 @@
 
 import { icon } from "../components/icons.js";
 import { colourLink } from "../core/api.js";
-import { currentShot } from "../core/state.js";
+import { currentCapture } from "../core/state.js";
 import { choice, question, slotLabel, tiles, versionName } from "../components/components.js";
 import { ALERTS, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -14,14 +14,14 @@ import { number, t } from "../i18n/translate.js";
 
 /** @param {State} state */
 export function picture(state, actions) {
-  const shot = currentShot(state);
-  if (!shot) return html`<div class="card making"><p>${t("mark.opening")}</p></div>`;
+  const capture = currentCapture(state);
+  if (!capture) return html`<div class="card making"><p>${t("mark.opening")}</p></div>`;
   if (state.asking) return html`${question(state, actions)} ${tiles(state, actions)}`;
   return html`
-    ${card(state, actions, shot)} ${state.picture === "none" ? nothing : tools(state, actions, shot.capture)} ${tiles(state, actions)}
-    <div class="actions">${actionButtons(state, actions, shot)}</div>
-    ${shot.capture ? (state.modules.details?.detailsDialog(state, actions, shot) ?? nothing) : nothing}
-    ${state.visit?.finished_at || complete(state, shot)
+    ${card(state, actions, capture)} ${state.picture === "none" ? nothing : tools(state, actions, capture.record)} ${tiles(state, actions)}
+    <div class="actions">${actionButtons(state, actions, capture)}</div>
+    ${capture.record ? (state.modules.details?.detailsDialog(state, actions, capture) ?? nothing) : nothing}
+    ${state.visit?.finished_at || complete(state, capture)
       ? html`<div class="finish" aria-hidden="true"></div>`
       : html`<button class="quiet finish" type="button" id="finish" @click=${actions.finish}>${t("finish.now")}</button>`}
   `;
@@ -30,30 +30,30 @@ export function picture(state, actions) {
 // Whether the primary button is already "Finish".
 const complete = ({ route }, { verdict }) => verdict?.word === "good" && !route.capture && !nextSlot(route.slot);
 
-/** Return the number of tries in this slot, including the current shot. */
-function triesOf({ visit }, shot) {
-  const slot = visit?.slots[shot.slot];
-  return (slot?.tries ?? 0) + (slot?.captures.includes(shot.id) ? 0 : 1);
+/** Return the number of tries in this slot, including the current capture. */
+function triesOf({ visit }, capture) {
+  const slot = visit?.slots[capture.slot];
+  return (slot?.tries ?? 0) + (slot?.captures.includes(capture.id) ? 0 : 1);
 }
 
 /** @param {State} state */
-const exhausted = (state, shot) =>
-  shot.verdict?.code === "shot.poor" || triesOf(state, shot) > (state.protocol?.retakes ?? 2);
+const exhausted = (state, capture) =>
+  capture.verdict?.code === "shot.poor" || triesOf(state, capture) > (state.protocol?.retakes ?? 2);
 
 // ---- card: same height with and without a verdict, so that the layout does not shift
 
 /** @param {State} state */
-function card(state, actions, shot) {
-  if (!shot.verdict && !shot.over) return makingCard(shot);
-  const [name, word, text] = verdictText(state, shot);
+function card(state, actions, capture) {
+  if (!capture.verdict && !capture.over) return makingCard(capture);
+  const [name, word, text] = verdictText(state, capture);
   return html`
-    <div class="card" data-verdict=${shot.verdict?.word ?? "none"} data-code=${shot.verdict?.code ?? shot.failed?.code ?? ""}>
+    <div class="card" data-verdict=${capture.verdict?.word ?? "none"} data-code=${capture.verdict?.code ?? capture.failed?.code ?? ""}>
       <div class="heading">
         <h2 tabindex="-1" id="result-title">${icon(name)} ${word}</h2>
-        ${timer(state, actions, shot) ?? (shot.capture ? detailsButton(actions, shot.capture) : nothing)}
+        ${timer(state, actions, capture) ?? (capture.record ? detailsButton(actions, capture.record) : nothing)}
       </div>
       <p>${text}</p>
-      ${shot.over ? nothing : progressBar(shot)}
+      ${capture.over ? nothing : progressBar(capture)}
     </div>
   `;
 }
@@ -74,35 +74,35 @@ function detailsButton(actions, { report }) {
 }
 
 /** @param {State} state */
-function verdictText(state, shot) {
-  if (shot.failed) return ["warn", t("verdict.again"), alertText(shot.failed)];
-  if (shot.verdict?.word === "good") {
-    return ["star", t("verdict.good"), [t("verdict.good.what"), shot.over ? "" : t("make.goon")].join(" ")];
+function verdictText(state, capture) {
+  if (capture.failed) return ["warn", t("verdict.again"), alertText(capture.failed)];
+  if (capture.verdict?.word === "good") {
+    return ["star", t("verdict.good"), [t("verdict.good.what"), capture.over ? "" : t("make.goon")].join(" ")];
   }
-  if (!shot.verdict) return ["check", t("verdict.none"), ""];
-  if (exhausted(state, shot)) return ["pen", t("verdict.again"), alertText({ code: "shot.poor", n: triesOf(state, shot) })];
-  const cause = ALERTS[shot.verdict.code] ? alertText({ code: shot.verdict.code }) : "";
+  if (!capture.verdict) return ["check", t("verdict.none"), ""];
+  if (exhausted(state, capture)) return ["pen", t("verdict.again"), alertText({ code: "shot.poor", n: triesOf(state, capture) })];
+  const cause = ALERTS[capture.verdict.code] ? alertText({ code: capture.verdict.code }) : "";
   return ["pen", t("verdict.again"), cause];
 }
 
 /** @param {State} state */
-function timer(state, actions, shot) {
-  if (shot.verdict?.code !== "shot.pupil" || exhausted(state, shot)) return null;
+function timer(state, actions, capture) {
+  if (capture.verdict?.code !== "shot.pupil" || exhausted(state, capture)) return null;
   const left = timeLeft(state.timer);
   return left
     ? html`<p class="clock">${left}</p>`
     : html`<button type="button" data-do="timer" @click=${() => actions.runAlertButton("timer")}>${icon("wait")} ${t("do.timer")}</button>`;
 }
 
-function makingCard(shot) {
-  const left = Math.round(shot.stage.left); // 0: unknown; then no estimate is shown
+function makingCard(capture) {
+  const left = Math.round(capture.stage.left); // 0: unknown; then no estimate is shown
   const titles = { expose: "make.expose", keep: "make.keep" };
-  const estimate = left >= 1 ? t("make.left", { n: left }) : shot.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
+  const estimate = left >= 1 ? t("make.left", { n: left }) : capture.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
   return html`
     <div class="card making">
-      <div class="heading"><h2>${t(titles[shot.stage.name] ?? "make.refine")}</h2></div>
+      <div class="heading"><h2>${t(titles[capture.stage.name] ?? "make.refine")}</h2></div>
       <p class="muted">${estimate}</p>
-      ${progressBar(shot)}
+      ${progressBar(capture)}
     </div>
   `;
 }
@@ -150,26 +150,26 @@ function versions(value, actions, capture) {
 // ---- buttons: the verdict selects the primary one
 
 /** @param {State} state */
-function actionButtons(state, actions, shot) {
+function actionButtons(state, actions, capture) {
   if (state.visit?.finished_at) return button(actions.backToOutcome, "result", "left", "result.seen");
-  if (!shot.verdict && !shot.over) {
-    const held = shot.stage.name === "expose"; // the next frames may be exposed after the quick look
+  if (!capture.verdict && !capture.over) {
+    const held = capture.stage.name === "expose"; // the next frames may be exposed after the quick look
     return html`<button class="primary shutter" type="button" id="shutter" aria-disabled="true" @click=${actions.take}>
       ${icon(held ? "hand" : "wait")} <span>${t(held ? "take.hold" : "take.making")}</span>
     </button>`;
   }
-  const current = state.visit?.slots[shot.slot]?.capture;
-  if (state.route.capture && current !== shot.id) {
+  const current = state.visit?.slots[capture.slot]?.capture;
+  if (state.route.capture && current !== capture.id) {
     return [button(actions.again, "again", "again", "result.again"), button(actions.useThis, "use", "check", "result.use", true)];
   }
-  if (shot.failed) return button(actions.again, "again", "again", "result.again", true);
-  if (shot.verdict?.word !== "again") {
+  if (capture.failed) return button(actions.again, "again", "again", "result.again", true);
+  if (capture.verdict?.word !== "again") {
     return [button(actions.again, "again", "again", "result.again"), next(state, actions, true)];
   }
-  if (exhausted(state, shot)) {
-    return [button(actions.again, "again", "again", "result.try"), button(actions.ask, "could-not", "cross", "result.couldnot", true)];
+  if (exhausted(state, capture)) {
+    return [button(actions.again, "again", "again", "result.try"), button(actions.ask, "not-possible", "cross", "result.notpossible", true)];
   }
-  const keep = shot.over ? button(actions.keepThis, "keep", "check", "result.keep") : next(state, actions, false);
+  const keep = capture.over ? button(actions.keepThis, "keep", "check", "result.keep") : next(state, actions, false);
   return [keep, button(actions.again, "again", "again", "result.again", true)];
 }
 
@@ -180,7 +180,7 @@ const button = (click, id, name, word, primary = false) => html`
 /** @param {State} state */
 function next(state, actions, primary) {
   const slot = nextSlot(state.route.slot);
-  const waits = !slot && state.shots.some((shot) => shot.visit === state.route.visit && !shot.over);
+  const waits = !slot && state.captures.some((capture) => capture.visit === state.route.visit && !capture.over);
   const { eye, part } = slotLabel(state, slot);
   return html`
     <button class=${primary ? "primary" : ""} type="button" id="next" aria-disabled=${waits} @click=${() => waits || actions.next()}>

@@ -5,9 +5,9 @@ import { icon } from "../components/icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, has, number, t } from "../i18n/translate.js";
 
-export function send({ outbox }, actions) {
-  if (!outbox) return nothing;
-  const { configured, sent, waiting, visits, next_try_s: wait } = outbox;
+export function send({ uploadQueue }, actions) {
+  if (!uploadQueue) return nothing;
+  const { configured, sent, waiting, visits, next_try_s: wait } = uploadQueue;
   return html`
     <section class="send">
       <h2>${t("send.title")}</h2>
@@ -20,7 +20,7 @@ export function send({ outbox }, actions) {
             ${icon("again")} ${t("do.tryNow")}
           </button>`
         : nothing}
-      <ul class="people">${visits.map((one) => outboxItem(one, actions))}</ul>
+      <ul class="people">${visits.map((one) => queuedVisit(one, actions))}</ul>
     </section>
   `;
 }
@@ -29,7 +29,7 @@ const headlineKey = (configured, waiting) => (!configured ? "send.off" : waiting
 
 const nextTryText = (wait) => (wait > 0 ? t("send.next", { n: Math.ceil(wait / 60) }) : t("send.soon"));
 
-function outboxItem({ visit, number: who, since, size_bytes: size, tries, error, stuck }, actions) {
+function queuedVisit({ visit, number: who, since, size_bytes: size, tries, error, stuck }, actions) {
   return html`<li data-stuck=${stuck}>
     <button type="button" data-visit=${visit} @click=${() => actions.go({ screen: "pictures", visit })}>
       <span>${who}</span> <span class="muted">${calendarDay(since)}, ${clockTime(since)}</span>

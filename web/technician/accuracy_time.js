@@ -14,7 +14,7 @@ const ALL = Object.freeze({ zoom: 1, u: 0, v: 0 });
 
 class AccuracyTime extends HTMLElement {
   /** @type {Record<string, any>} */
-  #state = { explorer: null, head: null, captures: [], capture: null, point: null, recomputed: null, viewport: ALL, all: false, alert: null };
+  #state = { accuracy: null, head: null, captures: [], capture: null, point: null, recomputed: null, viewport: ALL, all: false, alert: null };
   #timer = 0;
 
   connectedCallback() {
@@ -38,8 +38,8 @@ class AccuracyTime extends HTMLElement {
 
   async #load() {
     await this.#showErrors(async () => {
-      const [explorer, captures, head] = await Promise.all([fetchTechnician("GET"), recentCaptures(), fetchStatus()]);
-      this.#set({ explorer, captures, head, capture: this.#state.capture ?? captures[0] ?? null });
+      const [accuracy, captures, head] = await Promise.all([fetchTechnician("GET"), recentCaptures(), fetchStatus()]);
+      this.#set({ accuracy, captures, head, capture: this.#state.capture ?? captures[0] ?? null });
       this.#poll();
     });
   }
@@ -47,9 +47,9 @@ class AccuracyTime extends HTMLElement {
   // Poll every second while a measurement runs.
   #poll() {
     clearTimeout(this.#timer);
-    if (!this.#state.explorer?.busy || !this.isConnected) return;
+    if (!this.#state.accuracy?.busy || !this.isConnected) return;
     this.#timer = setTimeout(() => this.#showErrors(async () => {
-      this.#set({ explorer: await fetchTechnician("GET") });
+      this.#set({ accuracy: await fetchTechnician("GET") });
       this.#poll();
     }), POLL_MS);
   }
@@ -64,12 +64,12 @@ class AccuracyTime extends HTMLElement {
 
   #actions = {
     measure: () => this.#showErrors(async () => {
-      this.#set({ alert: null, explorer: await fetchTechnician("POST", "explorer", {}) });
+      this.#set({ alert: null, accuracy: await fetchTechnician("POST", "accuracy", {}) });
       this.#poll();
     }),
 
     choose: (pace) => this.#showErrors(async () => {
-      this.#set({ alert: null, explorer: await fetchTechnician("PUT", "pace", { pace }) });
+      this.#set({ alert: null, accuracy: await fetchTechnician("PUT", "pace", { pace }) });
     }),
 
     pick: ({ target }) => {
@@ -102,7 +102,7 @@ customElements.define("accuracy-time", AccuracyTime);
 const recentCaptures = async () => (await (await request("GET", "/api/captures?limit=12")).json()).captures;
 const fetchStatus = async () => (await request("GET", "/api/status")).json();
 /** @type {(method: string, resource?: string, body?: object) => Promise<any>} */
-const fetchTechnician = async (method, resource = "explorer", body = undefined) => (await request(method, `/api/technician/${resource}`, body)).json();
+const fetchTechnician = async (method, resource = "accuracy", body = undefined) => (await request(method, `/api/technician/${resource}`, body)).json();
 
 async function request(method, path, body) {
   /** @type {RequestInit} */
@@ -114,15 +114,15 @@ async function request(method, path, body) {
 }
 
 function view(state, actions) {
-  const { explorer, alert } = state;
-  if (!explorer) return html`<p role="status">${alert ? alert.message : t("explore.loading")}</p>`;
+  const { accuracy, alert } = state;
+  if (!accuracy) return html`<p role="status">${alert ? alert.message : t("explore.loading")}</p>`;
   return html`
     <h2>${t("explore.title")}</h2>
     <p>${t("explore.says")}</p>
     ${alert ? html`<p class="bad" role="alert">${sentences(alert)}</p>` : ""}
-    ${paceButtons(explorer, actions)}
-    ${measuring(explorer, actions)}
-    ${explorer.measured ? points(state, actions) : ""}
+    ${paceButtons(accuracy, actions)}
+    ${measuring(accuracy, actions)}
+    ${accuracy.measured ? points(state, actions) : ""}
     ${state.point ? comparison(state, actions) : ""}
   `;
 }
@@ -139,10 +139,10 @@ function paceButtons({ pace, paces_s: paceButtons }, actions) {
   `;
 }
 
-function measuring({ busy, said: progressText, problem, measured }, actions) {
+function measuring({ busy, progress, problem, measured }, actions) {
   return html`
     <p role="status" aria-live="polite">
-      ${busy ? `${t("explore.busy")} ${progressText}` : measured ? t("explore.when", {
+      ${busy ? `${t("explore.busy")} ${progress}` : measured ? t("explore.when", {
         day: measured.measured_at.slice(0, 10), time: clockTime(measured.measured_at), scene: measured.scene,
       }) : t("explore.never")}
       ${problem ? html`<span class="bad">${sentences(problem)}</span>` : ""}
@@ -151,10 +151,10 @@ function measuring({ busy, said: progressText, problem, measured }, actions) {
   `;
 }
 
-function points({ explorer, all, capture, captures }, actions) {
-  const { budget_s: budget, region } = explorer.measured;
+function points({ accuracy, all, capture, captures }, actions) {
+  const { budget_s: budget, region } = accuracy.measured;
   // The method for an unknown field is left out where the field is known: a capture never uses it there.
-  const points = explorer.measured.points.filter((one) => one.method !== "open" || !region?.field_known);
+  const points = accuracy.measured.points.filter((one) => one.method !== "open" || !region?.field_known);
   const rows = points.filter((one) => all || one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   return html`
     ${plot(points, budget, actions, capture !== null)}

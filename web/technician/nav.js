@@ -12,7 +12,7 @@ import { t } from "../i18n/translate.js";
 const SECTIONS = {
   calibration: null, // drawn by the wizard
   health: html`<instrument-health class="column"></instrument-health>`,
-  explorer: html`<accuracy-time class="column"></accuracy-time>`,
+  accuracy: html`<accuracy-time class="column"></accuracy-time>`,
   "event-log": html`<instrument-event-log class="column"></instrument-event-log>`,
   backup: html`<instrument-backup class="column"></instrument-backup>`,
   space: html`<stored-pictures class="column"></stored-pictures>`,
@@ -22,10 +22,10 @@ const SECTIONS = {
 /** Navigation bar and current section; `calibration` draws the first one. */
 export function navigation(state, actions, calibration) {
   return html`
-    <nav class="rooms" aria-label=${t("rooms")}>
+    <nav class="sections" aria-label=${t("sections")}>
       ${Object.keys(SECTIONS).map((name) => html`<button
-        type="button" data-room=${name} aria-current=${name === state.section ? "page" : "false"} @click=${() => actions.openSection(name)}
-      >${t(`room.${name}`)}</button>`)}
+        type="button" data-section=${name} aria-current=${name === state.section ? "page" : "false"} @click=${() => actions.openSection(name)}
+      >${t(`section.${name}`)}</button>`)}
     </nav>
     ${SECTIONS[state.section] ?? calibration(state, actions)}
   `;

@@ -95,7 +95,7 @@ class SoftwareUpdate extends HTMLElement {
 
 customElements.define("software-update", SoftwareUpdate);
 
-const fetchWaiting = async () => (await (await fetch("/api/outbox", { cache: "no-store" })).json()).waiting;
+const fetchWaiting = async () => (await (await fetch("/api/upload-queue", { cache: "no-store" })).json()).waiting;
 
 function view(state, actions) {
   const { status, waiting, lost, alert, sent } = state;

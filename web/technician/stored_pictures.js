@@ -29,8 +29,8 @@ class StoredPictures extends HTMLElement {
   #actions = {
     ask: () => this.#set({ asks: true, message: "", error: "" }),
     keep: () => this.#set({ asks: false }),
-    remove: () => this.#request("POST", URL, t("room.removed")),
-    undo: () => this.#request("POST", `${URL}/undo`, t("room.undone")),
+    remove: () => this.#request("POST", URL, t("stored.removed")),
+    undo: () => this.#request("POST", `${URL}/undo`, t("stored.undone")),
   };
 }
 
@@ -40,8 +40,8 @@ const megabytes = (bytes) => Math.ceil(bytes / 1e6);
 
 function view({ removal, asks, error, message }, actions) {
   return html`
-    <h2>${t("room.space")}</h2>
-    <p>${t("room.rule")}</p>
+    <h2>${t("section.space")}</h2>
+    <p>${t("stored.rule")}</p>
     ${error ? html`<p class="bad" role="alert">${error}</p>` : nothing}
     ${removal ? html`<p role="status">${removable(removal)}</p>${asks ? question(removal, actions) : buttons(removal, actions)}` : nothing}
     <p role="note">${message}</p>
@@ -49,17 +49,17 @@ function view({ removal, asks, error, message }, actions) {
 }
 
 const removable = ({ visits, captures, size_bytes: bytes, oldest_day: from, newest_day: to }) =>
-  visits ? t("room.removable", { visits, captures, mb: megabytes(bytes), from, to }) : t("room.none");
+  visits ? t("stored.removable", { visits, captures, mb: megabytes(bytes), from, to }) : t("stored.none");
 
-const question = ({ captures }, actions) => html`<p><b>${t("room.sure", { captures })}</b></p>
+const question = ({ captures }, actions) => html`<p><b>${t("stored.sure", { captures })}</b></p>
   <div class="row">
-    <button class="primary" type="button" id="remove-now" @click=${actions.remove}>${t("room.remove")}</button>
-    <button type="button" @click=${actions.keep}>${t("room.keep")}</button>
+    <button class="primary" type="button" id="remove-now" @click=${actions.remove}>${t("stored.remove")}</button>
+    <button type="button" @click=${actions.keep}>${t("stored.keep")}</button>
   </div>`;
 
 const buttons = ({ visits, undoable_captures: undoable, undoable_bytes: bytes }, actions) => html`<div class="row">
-  ${visits ? html`<button class="primary" type="button" id="remove" @click=${actions.ask}>${t("room.remove")}</button>` : nothing}
+  ${visits ? html`<button class="primary" type="button" id="remove" @click=${actions.ask}>${t("stored.remove")}</button>` : nothing}
   ${undoable
-    ? html`<button type="button" id="undo-removal" @click=${actions.undo}>${t("room.undo", { n: undoable, mb: megabytes(bytes) })}</button>`
+    ? html`<button type="button" id="undo-removal" @click=${actions.undo}>${t("stored.undo", { n: undoable, mb: megabytes(bytes) })}</button>`
     : nothing}
 </div>`;

@@ -9,7 +9,7 @@ from device.recon.reconstructor import Recipe
 from device.values import Calibration
 from services.http.media import PngResponse, file_responses
 from services.http.problem_responses import error_text
-from services.http.schemas.accuracy import ExplorerAnswer, TimeBudgetChoice
+from services.http.schemas.accuracy import AccuracyAnswer, TimeBudgetChoice
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
 from services.records.capture_store import CaptureStore
 
@@ -21,7 +21,7 @@ def accuracy_routes(
 ) -> APIRouter:
     """Return the router of the accuracy explorer under /api/technician; `calibration` returns the one in use."""
     router = APIRouter(prefix="/api/technician")
-    router.include_router(_explorer_router(explorer))
+    router.include_router(_accuracy_router(explorer))
 
     @router.get("/captures/{id}/again.png", response_class=PngResponse, responses=PNG)
     def reconstruct_again(
@@ -39,43 +39,43 @@ def accuracy_routes(
     return router
 
 
-def _explorer_router(explorer: AccuracyExplorer) -> APIRouter:
+def _accuracy_router(explorer: AccuracyExplorer) -> APIRouter:
     """Return the router of the measurement and of the time budget."""
     router = APIRouter()
 
-    @router.get("/explorer")
-    def accuracy() -> ExplorerAnswer:
+    @router.get("/accuracy")
+    def accuracy() -> AccuracyAnswer:
         """Return the measured accuracy and time of every method on this device, and the chosen time budget."""
-        return explorer_answer(explorer)
+        return accuracy_answer(explorer)
 
-    @router.post("/explorer", status_code=202)
-    def measure() -> ExplorerAnswer:
+    @router.post("/accuracy", status_code=202)
+    def measure() -> AccuracyAnswer:
         """Start to measure every method on this device, in the background.
 
         The measurement takes minutes; captures have priority. Answers 202 with the state; 409 while another measurement
         or picture is computed.
         """
         explorer.measure()
-        return explorer_answer(explorer)
+        return accuracy_answer(explorer)
 
     @router.put("/pace")
-    def choose(choice: TimeBudgetChoice) -> ExplorerAnswer:
+    def choose(choice: TimeBudgetChoice) -> AccuracyAnswer:
         """Set the time budget of pictures, from the next capture on; 422 for an unknown name."""
         explorer.choose(choice.pace)
-        return explorer_answer(explorer)
+        return accuracy_answer(explorer)
 
     return router
 
 
-def explorer_answer(explorer: AccuracyExplorer) -> ExplorerAnswer:
+def accuracy_answer(explorer: AccuracyExplorer) -> AccuracyAnswer:
     """Return the state of the accuracy explorer."""
     now = explorer.state()
-    return ExplorerAnswer(
+    return AccuracyAnswer(
         measured=now.measured,
         pace=now.pace,
         paces_s=dict(now.paces_s),
         busy=now.busy,
-        said=now.progress,
+        progress=now.progress,
         scene=now.scene,
         problem=error_text(now.problem),
     )

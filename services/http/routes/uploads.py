@@ -18,7 +18,7 @@ def upload_router(sender: UploadWorker | None) -> APIRouter:
     """Return the router of the upload queue; `sender` None means that no receiver is set up."""
     router = APIRouter()
 
-    @router.get("/api/outbox")
+    @router.get("/api/upload-queue")
     def upload_queue() -> QueueAnswer:
         """Return the visits in the upload queue, the longest waiting first, and the seconds until the next try.
 
@@ -26,7 +26,7 @@ def upload_router(sender: UploadWorker | None) -> APIRouter:
         """
         return queue_answer(sender)
 
-    @router.post("/api/outbox/try")
+    @router.post("/api/upload-queue/retry")
     def retry_now(order: UploadRetry) -> QueueAnswer:
         """Retry uploads at once, without waiting for the backoff; 409 (`send.off`) if no receiver is set up."""
         if sender is None:

@@ -103,7 +103,7 @@ def _slot_router(repository: VisitRepository) -> APIRouter:
     """Return the router of the endpoints that fill picture slots."""
     router = APIRouter()
 
-    @router.post("/api/visits/{id}/could-not")
+    @router.post("/api/visits/{id}/not-possible")
     def record_missing_picture(id: str, order: MissingPicture) -> VisitAnswer:
         """Record that a picture could not be taken.
 
@@ -119,7 +119,7 @@ def _slot_router(repository: VisitRepository) -> APIRouter:
         """
         return visit_answer(repository.pictures.choose(order.key, id, order.slot, order.capture), repository)
 
-    @router.post("/api/captures/{id}/keep")
+    @router.post("/api/captures/{id}/accept")
     def keep(id: str, order: IdempotentRequest) -> VisitAnswer:
         """Fill the capture's own slot with this capture; 404 for a test picture, 409 for a finished visit."""
         return visit_answer(repository.pictures.accept_capture(order.key, id), repository)

@@ -12,8 +12,8 @@ class TimeBudgetChoice(RequestBody):
     pace: Pace
 
 
-class ExplorerAnswer(ResponseBody):
-    """Last measurement, selected time budget, progress of a running computation (`said`), and last error.
+class AccuracyAnswer(ResponseBody):
+    """Last measurement, selected time budget, progress of a running computation (`progress`), and last error.
 
     `paces_s`: time budgets in seconds by name. `busy`: a computation is running. `scene`: the simulated scene.
     """
@@ -22,6 +22,6 @@ class ExplorerAnswer(ResponseBody):
     pace: Pace
     paces_s: dict[Pace, float]
     busy: bool
-    said: str
+    progress: str
     scene: str
     problem: ErrorText | None

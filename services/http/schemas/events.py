@@ -61,10 +61,10 @@ class Failure(ErrorText):
     id: OmittedIfNone[str] = None
 
 
-class ExplorerProgress(ResponseBody):
+class AccuracyProgress(ResponseBody):
     """Progress text of the accuracy explorer; empty at the end."""
 
-    said: str
+    progress: str
 
 
 class AlertChange(AlertAnswer):
@@ -135,11 +135,11 @@ class FailedEvent(ResponseBody):
     data: Failure
 
 
-class ExplorerEvent(ResponseBody):
-    """Event `explorer`."""
+class AccuracyEvent(ResponseBody):
+    """Event `accuracy`."""
 
-    event: Literal["explorer"]
-    data: ExplorerProgress
+    event: Literal["accuracy"]
+    data: AccuracyProgress
 
 
 class NoticeEvent(ResponseBody):
@@ -164,7 +164,7 @@ ServerSentEvent = Annotated[
     | VerdictEvent
     | KeptEvent
     | FailedEvent
-    | ExplorerEvent
+    | AccuracyEvent
     | NoticeEvent
     | CalibrationEvent,
     Field(discriminator="event"),

@@ -65,7 +65,7 @@ class SlotAnswer(ResponseBody):
     `reason`: why a picture is not possible, or null.
     """
 
-    state: Literal["empty", "taken", "could_not"]
+    state: Literal["empty", "taken", "not_possible"]
     capture: str | None
     captures: list[str]
     verdict: VerdictAnswer | None
