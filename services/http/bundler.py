@@ -13,8 +13,8 @@ from posixpath import dirname, join, normpath, relpath
 _IMPORT = re.compile(r'^import (?:([^;"]*?) from )?"(\.[^"]+)";', re.M)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (?:(\w+)|\{([^}]*)\}))", re.M)
 _LIST = re.compile(r"\bexport ?\{([^{}]*)\};?\s*(?://.*\s*)?\Z")  # the export list at the end of a vendored module
-_UNSUPPORTED = re.compile(r"^(?:import|export)\b.*|^.*\bimport\.meta\b.*|^.*\bimport\((?![\"`]\.).*", re.M)
-_ON_DEMAND = re.compile(r'(?<=\bimport\()(["`])(\.[^"`]+)\1')
+_UNSUPPORTED = re.compile(r"^(?:import|export)\b.*|^.*\bimport\.meta\b.*|^.*\bimport\((?!\"\.).*", re.M)
+_ON_DEMAND = re.compile(r'(?<=\bimport\()"(\.[^"]+)"')
 _DOCUMENTATION = re.compile(r"^[ \t]*/\*\*(?:(?!\*/).)*\*/\n", re.M | re.S)  # whole lines only
 _SHEET = re.compile(r'^@import "([^"]+)";$', re.M)
 
@@ -81,8 +81,7 @@ class _Module:
 
     def _on_demand(self, found: re.Match[str]) -> str:
         """Return the quoted path of an `import()`, relative to the entry, in whose file the bundled module runs."""
-        quote, path = found.groups()
-        return f"{quote}{_relative(normpath(join(dirname(self._name), path)), self._entry)}{quote}"
+        return f'"{_relative(normpath(join(dirname(self._name), found[1])), self._entry)}"'
 
     def as_part(self) -> str:
         """Return the text of the module as a function that is called once and returns the exports."""

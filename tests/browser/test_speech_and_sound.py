@@ -1,7 +1,7 @@
 """Speech output in the patient's language, tones, vibrations, and the visual replacement without a voice."""
 
 import itertools
-import re
+import json
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,8 @@ READY, TAKEN, GOOD, POOR = [880], [1320], [660, 990], [392, 262]
 
 def sentences(language: str) -> dict[str, str]:
     """Return the sentences of a language from its file."""
-    text = (WEB / f"i18n/{language}.js").read_text()
-    return dict(re.findall(r'^  "(say\.\w+)":\s+"([^"]+)"', text, re.M))
+    table: dict[str, str] = json.loads((WEB / f"i18n/{language}.json").read_text())
+    return {key: words for key, words in table.items() if key.startswith("say.")}
 
 
 def without_repeats(cues: list[Any]) -> list[Any]:

@@ -1,5 +1,6 @@
 """Each state of the page is reached by a simulated fault over the real server, with the numbers of its text."""
 
+import json
 import re
 import secrets
 from collections.abc import Callable, Iterator
@@ -35,8 +36,8 @@ K = 4  # binning of the paper's sensor, K x K pixels
 WEB = Path(__file__).parents[2] / "web"
 ALERTS = (WEB / "core/alerts.js").read_text()
 STATES = re.findall(r'"(\w+\.\w+)"', ALERTS.split("const TABLE = [")[1].split("\n];")[0])
-SPOKEN = r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"'
-WORDS = dict(re.findall(SPOKEN, (WEB / "i18n/en.js").read_text()))
+ENGLISH: dict[str, str] = json.loads((WEB / "i18n/en.json").read_text())
+WORDS = {key.removeprefix("state.").removesuffix("_other"): words for key, words in ENGLISH.items()}
 REFUSALS = {
     "camera.missing",
     "light.fault",
@@ -83,7 +84,8 @@ def rig(equipped: tuple[Rig, DiskStub]) -> Iterator[Rig]:
 def assert_text_is_complete(code: str, observed: Observation) -> None:
     """Assert that the response has every number which the text of the page needs, and a refusal a remedy."""
     assert faults.page_code(WEB, observed.code) == code
-    needed = set(re.findall(r"\{(\w+)\}", WORDS[code])) - {"part"} | ({"slot"} if "{part}" in WORDS[code] else set())
+    sent = {"part": "slot", "count": "n"}  # the server's names of what the page puts into a text
+    needed = {sent.get(name, name) for name in re.findall(r"\{\{(\w+)\}\}", WORDS[code])}
     assert needed <= observed.facts.keys()
     if code in REFUSALS:
         assert len(observed.remedy) > 20

@@ -41,12 +41,11 @@ def test_lazy_module_shares_objects_with_bundle() -> None:
 def test_dynamic_import_path_is_relative_to_entry() -> None:
     modules = {
         "pages/app.js": 'import { f } from "../core/a.js";\nconst later = () => import("./late.js");\n',
-        "core/a.js": 'export const f = () => import("./b.js");\nconst g = (tag) => import(`../i18n/${tag}.js`);\n',
+        "core/a.js": 'export const f = () => import("./b.js");\n',
     }
     files = bundle_module("pages/app.js", modules.__getitem__)
     assert re.findall(r"import\((.*)\);", files["pages/app.js"]) == [
         '"../core/b.js"',
-        "`../i18n/${tag}.js`",
         '"./late.js"',
     ]
     assert files["core/a.js"].startswith('import { parts } from "../pages/app.js";')
@@ -92,7 +91,7 @@ def test_bundles_keep_every_line(module: str, sheet: str) -> None:
 @pytest.mark.parametrize(("module", "sheet"), PAGES.values())
 def test_dynamic_imports_of_pages_exist(module: str, sheet: str) -> None:
     whole = bundle_module(module, lambda name: Path(WEB / name).read_text())[module]
-    paths = [path for _, path in re.findall(r"""\bimport\((["`])([^"`]+)\1\)""", whole)]
+    paths = re.findall(r'\bimport\("([^"]+)"\)', whole)
     assert paths
     for path in paths:
-        assert list((WEB / module).parent.glob(re.sub(r"\$\{\w+\}", "*", path))), path
+        assert (WEB / module).parent.joinpath(path).is_file(), path

@@ -206,7 +206,7 @@ export function choice({ label, field, value, options, choose, many = false }) {
 }
 
 /** Name of a version of a picture: its number, and the day on which the store adopted it. */
-export const versionName = ({ number, at }) => t("version.n", { n: number, day: at ? calendarDay(at) : "" });
+export const versionName = ({ number, at }) => t("version.n", { count: number, day: at ? calendarDay(at) : "" });
 
 /**
  * The question in place of the controls: why a picture is not possible, or whether to finish without all pictures.
@@ -218,7 +218,7 @@ export const question = (state, actions) => (state.asking === "finish" ? finishQ
 function finishQuestion(state, actions) {
   return html`
     <div class="reasons" id="finish-question" role="group" aria-labelledby="missing">
-      <h2 id="missing">${t("finish.missing", { n: missingPictures(state) })}</h2>
+      <h2 id="missing">${t("finish.missing", { count: missingPictures(state) })}</h2>
       <button class="primary" type="button" id="take-missing" @click=${actions.takeMissing}>${icon("camera")} ${t("finish.take")}</button>
       <button type="button" id="finish-without" @click=${actions.finishWithout}>${t("finish.now")}</button>
       <button class="quiet" type="button" id="not-asked" @click=${actions.stopAsking}>${t("back")}</button>

@@ -1,5 +1,5 @@
 // Alerts: one table of all states that the page can show, and the rules that choose what is visible. Texts:
-// "state.CODE" in en.js. A blocking alert is shown in the prompt bar and in the shutter ("stop.CODE"), an advisory one
+// "state.CODE" in i18n/en.json. A blocking alert is shown in the prompt bar and in the shutter ("stop.CODE"), an advisory one
 // as a chip.
 
 import { sentences } from "./api.js";
@@ -92,8 +92,9 @@ export function alertText({ code, message, remedy, ...vars }) {
 }
 
 /** @type {(vars: {eye?: string, other?: string, slot?: string, [more: string]: any}) => Record<string, any>} */
-const translatedValues = ({ eye, other, slot, ...vars }) => ({
+const translatedValues = ({ eye, other, slot, n, ...vars }) => ({
   ...vars,
+  count: n,
   ...(eye ? { eye: t(`eye.${eye}`) } : {}),
   ...(other ? { other: t(`eye.${other}.word`) } : {}),
   ...(/^\d{4}-/.test(vars.date) ? { date: calendarDay(vars.date) } : {}),

@@ -47,7 +47,7 @@ function raiseInterrupted(swept) {
   set({ interruptedShown: true });
   const [first] = swept;
   const known = swept.length === 1 && first.slot ? first : { buttons: ["ok"] };
-  raiseAlert({ code: "power.lost", message: t("swept", { n: swept.length }), ...known, from: "page" });
+  raiseAlert({ code: "power.lost", message: t("swept", { count: swept.length }), ...known, from: "page" });
 }
 
 // Screens that show what was taken. A page on one of them never takes the camera, and releases it.

@@ -1,6 +1,4 @@
-// Translation functions: English texts, or a language that is loaded when it is chosen.
-
-import { ENGLISH } from "./en.js";
+// Translation functions: texts of the chosen language from JSON catalogues, English where one is missing.
 
 /** Languages of the exam page. Drafts were not checked by a native speaker and are marked in the choice. */
 export const LANGUAGES = Object.freeze({
@@ -11,54 +9,87 @@ export const LANGUAGES = Object.freeze({
 });
 
 let language = "en-u-nu-latn"; // Latin digits in every language
-let texts = ENGLISH;
 let plurals = new Intl.PluralRules(language);
 
-/** Use another language: texts that `table` lacks stay English. `tag` is a BCP 47 tag such as "hi". */
-export function useLanguage(tag, table) {
-  language = `${tag}-u-nu-latn`;
-  texts = { ...ENGLISH, ...table };
-  plurals = new Intl.PluralRules(language);
-  document.documentElement.lang = tag;
+// Texts by key in i18next's JSON format: flat keys, {{name}} for a value, KEY_one and KEY_other for a plural.
+/** @typedef {Readonly<Record<string, string>>} Texts */
+/** @type {Texts} */
+let english = {};
+/** @type {Texts} */
+let texts = english;
+
+const RETRY_MS = 1000;
+
+/**
+ * Fetch a catalogue, empty where the server has none; try again as long as there is no connection. The page preloads
+ * the English one, and the others are beside it.
+ * @param {string} name
+ * @returns {Promise<Texts>}
+ */
+async function fetchTexts(name) {
+  const { href } = /** @type {HTMLLinkElement} */ (document.querySelector("#texts"));
+  try {
+    const response = await fetch(new URL(`${name}.json`, href));
+    return response.ok ? await response.json() : {};
+  } catch (problem) {
+    if (!(problem instanceof TypeError)) throw problem;
+    await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+    return fetchTexts(name);
+  }
 }
 
 /**
- * Load and use a language; "en-XA" is a pseudo-locale, 40 % longer than English, to find untranslated and clipped
- * texts.
+ * Load and use a language, English where it lacks a text; "en-XA" is a pseudo-locale, 40 % longer than English, to
+ * find untranslated and clipped texts. `more` names a catalogue of further English texts.
+ * @param {string} tag
+ * @param {string} [more]
  */
-export async function loadLanguage(tag) {
-  if (tag === "en-XA") useLanguage(tag, pseudoLocale());
-  else useLanguage(LANGUAGES[tag] ? tag : "en", await loadTexts(tag));
+export async function loadLanguage(tag, more) {
+  const used = tag in LANGUAGES || tag === "en-XA" ? tag : "en";
+  const [master, draft, further] = await Promise.all([loadTexts("en"), loadTexts(used), more ? fetchTexts(more) : {}]);
+  english = { ...master, ...further };
+  texts = used === "en-XA" ? pseudoLocale(english) : { ...english, ...draft };
+  language = `${used}-u-nu-latn`;
+  plurals = new Intl.PluralRules(language);
+  document.documentElement.lang = used;
 }
 
-/** Load the texts of a language on demand. */
-export const loadTexts = async (tag) => (LANGUAGES[tag]?.draft ? (await import(`./${tag}.js`)).WORDS : ENGLISH);
+/** @type {Map<string, Promise<Texts>>} */
+const catalogues = new Map();
+
+/** Load the texts of a language, those of the master for one without a catalogue; each is fetched once. */
+export function loadTexts(tag) {
+  const name = LANGUAGES[tag]?.draft ? tag : "en";
+  if (!catalogues.has(name)) catalogues.set(name, fetchTexts(name));
+  return /** @type {Promise<Texts>} */ (catalogues.get(name));
+}
 
 const ACCENTS = { a: "á", e: "é", i: "í", o: "ó", u: "ú", A: "Á", E: "É", I: "Í", O: "Ó", U: "Ú", n: "ñ", c: "ç" };
 
-function pseudoLocale() {
+/** @param {Texts} master */
+function pseudoLocale(master) {
   const lengthen = (text) => {
-    const accented = text.replace(/\{\w+\}|[a-zA-Z]/g, (part) => ACCENTS[part] ?? part);
+    const accented = text.replace(/\{\{\w+\}\}|[a-zA-Z]/g, (part) => ACCENTS[part] ?? part);
     return `[${accented}${" one two three four five six seven".slice(0, Math.round(text.length * 0.4))}]`;
   };
-  const both = (entry) => (typeof entry === "string" ? lengthen(entry) : { one: lengthen(entry.one), other: lengthen(entry.other) });
-  return Object.fromEntries(Object.entries(ENGLISH).map(([key, entry]) => [key, both(entry)]));
+  return Object.fromEntries(Object.entries(master).map(([key, text]) => [key, lengthen(text)]));
 }
 
-/** Return the text of `key` with {names} replaced; `vars.n` selects the plural form. */
+/** Return the text of `key`, in the plural form of `count`; undefined without one. */
+const found = (table, key, count) => table[`${key}_${plurals.select(count)}`] ?? table[`${key}_other`] ?? table[key];
+
+/** Return the text of `key` with {{names}} replaced; `vars.count` selects the plural form. */
 export function t(key, vars = {}) {
-  const entry = texts[key];
-  if (entry === undefined) throw new Error(`no words for ${key}`);
-  const text = typeof entry === "string" ? entry : (entry[plurals.select(vars.n)] ?? entry.other);
-  return text.replace(/\{(\w+)\}/g, (_, name) => String(vars[name]));
+  const text = found(texts, key, vars.count);
+  if (text === undefined) throw new Error(`no words for ${key}`);
+  return text.replace(/\{\{(\w+)\}\}/g, (_, name) => String(vars[name]));
 }
 
 /** Return whether `key` has a text and `vars` has every value that it needs. */
 export function has(key, vars = {}) {
-  const entry = ENGLISH[key];
-  if (entry === undefined) return false;
-  const text = typeof entry === "string" ? entry : entry.other;
-  return [...text.matchAll(/\{(\w+)\}/g)].every(([, name]) => vars[name] !== undefined && vars[name] !== null);
+  const text = english[`${key}_other`] ?? english[key];
+  if (text === undefined) return false;
+  return [...text.matchAll(/\{\{(\w+)\}\}/g)].every(([, name]) => vars[name] !== undefined && vars[name] !== null);
 }
 
 export function clockTime(iso) {

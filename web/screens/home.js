@@ -36,15 +36,15 @@ const earlierDay = ({ day }) => (day === today() ? "" : ` · ${calendarDay(`${da
 function dayCounts({ done, to_finish: open, referred, declined }) {
   return html`
     <p class="day">
-      <b>${t("home.today")}</b> <span>${t("home.done", { n: done })}</span> <span>${t("home.open", { n: open })}</span>
-      <span>${t("home.referred", { n: referred })}</span> ${declined ? html`<span>${t("home.declined", { n: declined })}</span>` : nothing}
+      <b>${t("home.today")}</b> <span>${t("home.done", { count: done })}</span> <span>${t("home.open", { count: open })}</span>
+      <span>${t("home.referred", { count: referred })}</span> ${declined ? html`<span>${t("home.declined", { count: declined })}</span>` : nothing}
     </p>
   `;
 }
 
 const sendingButton = ({ sent, waiting }, actions) =>
   html`<button class="quiet" type="button" id="send" @click=${() => actions.go({ screen: "send" })}>
-    ${icon(waiting ? "wait" : "check")} <span>${t("home.sent", { n: sent })} · ${t("home.waiting", { n: waiting })}</span>
+    ${icon(waiting ? "wait" : "check")} <span>${t("home.sent", { count: sent })} · ${t("home.waiting", { count: waiting })}</span>
   </button>`;
 
 /** @param {State} state */

@@ -54,7 +54,7 @@ export const reopenButton = ({ undo_until: allowed }, actions) =>
 function pendingPictures(visit, state, actions) {
   const captures = pendingCaptures(state, visit.id);
   return html`<section class="outcome" id="finishing">
-    <h2>${icon("wait")} ${t("outcome.making", { n: Math.max(1, captures.length) })}</h2>
+    <h2>${icon("wait")} ${t("outcome.making", { count: Math.max(1, captures.length) })}</h2>
     ${captures.map(
       ({ slot, stage }) => html`<label class="making">
         ${slotLabel(state, slot).eye} · ${slotLabel(state, slot).part}

@@ -79,7 +79,7 @@ function header(state, actions) {
 }
 
 // Free space in patients, as an exact number only when it is small.
-const spaceText = (patients) => t(patients > SPACE_PLENTY ? "space.plenty" : "space", { n: patients > 50 ? Math.floor(patients / 10) * 10 : patients });
+const spaceText = (patients) => t(patients > SPACE_PLENTY ? "space.plenty" : "space", { count: patients > 50 ? Math.floor(patients / 10) * 10 : patients });
 
 // When every capture in progress has a verdict, the patient need not hold still, so "making" is shown instead of
 // "busy".

@@ -97,7 +97,7 @@ function timer(state, actions, capture) {
 function makingCard(capture) {
   const left = Math.round(capture.stage.left); // 0: unknown; then no estimate is shown
   const titles = { expose: "make.expose", keep: "make.keep" };
-  const estimate = left >= 1 ? t("make.left", { n: left }) : capture.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
+  const estimate = left >= 1 ? t("make.left", { count: left }) : capture.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
   return html`
     <div class="card making">
       <div class="heading"><h2>${t(titles[capture.stage.name] ?? "make.refine")}</h2></div>

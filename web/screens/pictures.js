@@ -26,7 +26,7 @@ export function pictures(state, actions) {
         ${picked.length === 2
           ? html`<button class="primary" type="button" id="compare" @click=${actions.compare}>${t("pictures.compare")}</button>`
           : taken.length > 1
-            ? html`<p class="muted">${t("pictures.pick", { n: 2 - picked.length })}</p>`
+            ? html`<p class="muted">${t("pictures.pick", { count: 2 - picked.length })}</p>`
             : nothing}
         ${visit.finished_at
           ? reopenButton(visit, actions)
@@ -47,7 +47,7 @@ function captureLabel(state, id) {
   const found = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id));
   if (!found) return "";
   const [slot, { captures }] = found;
-  return t(captures.length > 1 ? "pictures.name.n" : "pictures.name", { ...slotLabel(state, slot), n: captures.indexOf(id) + 1 });
+  return t(captures.length > 1 ? "pictures.name.n" : "pictures.name", { ...slotLabel(state, slot), count: captures.indexOf(id) + 1 });
 }
 
 /** Return whether this capture, of several, is the one in use. */
@@ -78,13 +78,13 @@ function captureItem(state, actions, { slot, id }) {
 function montage(visit, actions, eye, { state, digest, pictures, placed }) {
   if (!pictures) return nothing;
   const used = placed.filter((one) => one.used).length;
-  const text = t(`montage.${state}`, { n: used });
+  const text = t(`montage.${state}`, { count: used });
   const leftOut = state === "joined" && used < pictures ? t("montage.leftout") : "";
   return html`<figure class="montage" data-eye=${eye} data-state=${state}>
     <figcaption><b>${t(`eye.${eye}`)}</b> <span aria-live="polite">${text} ${leftOut}</span></figcaption>
     ${state === "joined"
       ? html`<eye-pic
-          aria-label=${t("montage.name", { eye: t(`eye.${eye}`), n: used })}
+          aria-label=${t("montage.name", { eye: t(`eye.${eye}`), count: used })}
           .subject=${digest}
           .src=${{ url: montagePictureUrl(visit.id, eye, digest), mark: "final" }}
           @fault=${actions.pictureFault}

@@ -12,8 +12,8 @@ export function send({ uploadQueue }, actions) {
     <section class="send">
       <h2>${t("send.title")}</h2>
       <div aria-live="polite">
-        <p class="verdict">${icon(waiting ? "wait" : "check")} ${t(headlineKey(configured, waiting), { n: waiting })}</p>
-        ${configured ? html`<p>${t("send.today", { n: sent })} ${waiting ? nextTryText(wait) : ""}</p>` : nothing}
+        <p class="verdict">${icon(waiting ? "wait" : "check")} ${t(headlineKey(configured, waiting), { count: waiting })}</p>
+        ${configured ? html`<p>${t("send.today", { count: sent })} ${waiting ? nextTryText(wait) : ""}</p>` : nothing}
       </div>
       ${waiting
         ? html`<button class="primary" type="button" id="try-now" @click=${() => actions.retryUploads()}>
@@ -27,14 +27,14 @@ export function send({ uploadQueue }, actions) {
 
 const headlineKey = (configured, waiting) => (!configured ? "send.off" : waiting ? "send.waiting" : "send.none");
 
-const nextTryText = (wait) => (wait > 0 ? t("send.next", { n: Math.ceil(wait / 60) }) : t("send.soon"));
+const nextTryText = (wait) => (wait > 0 ? t("send.next", { count: Math.ceil(wait / 60) }) : t("send.soon"));
 
 function queuedVisit({ visit, number: who, since, size_bytes: size, tries, error, stuck }, actions) {
   return html`<li data-stuck=${stuck}>
     <button type="button" data-visit=${visit} @click=${() => actions.go({ screen: "pictures", visit })}>
       <span>${who}</span> <span class="muted">${calendarDay(since)}, ${clockTime(since)}</span>
       <span class="end">
-        ${t("send.size", { n: number(size / 1e6) })}${tries ? ` · ${t("send.tries", { n: tries })}` : ""}
+        ${t("send.size", { count: number(size / 1e6) })}${tries ? ` · ${t("send.tries", { count: tries })}` : ""}
       </span>
     </button>
     ${error ? errorLine(error, stuck) : nothing}

@@ -5,8 +5,7 @@ import { navigation } from "./nav.js";
 import { errorBox, icon, prompt, when } from "./page_parts.js";
 import { lensCard, lensResult, lensRun } from "./trial_lenses.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { number, t } from "../i18n/translate.js";
-import { TECHNICIAN } from "../i18n/en_technician.js";
+import { has, number, t } from "../i18n/translate.js";
 
 // The headline number of each step: its key in the step's result, and in the archived calibration.
 const HEADLINES = {
@@ -24,7 +23,7 @@ const RESULTS = [
   "dark_e_per_s", "prnu", "screen_shading",
 ];
 
-const textOr = (key, otherwise, vars) => t(key in TECHNICIAN ? key : otherwise, vars);
+const textOr = (key, otherwise, vars) => t(has(key, vars) ? key : otherwise, vars);
 
 /** Template of the whole technician page. */
 export function technicianPage(state, actions) {
@@ -67,7 +66,7 @@ function header({ cal, theme, view, lost }, actions) {
 
 function loginForm({ hasPin, pin, wait, error, busy }, actions) {
   const key = (digit) => html`<button type="button" @click=${() => actions.digit(digit)}>${digit}</button>`;
-  const word = wait > 0 ? t("pin.wait", { n: Math.ceil(wait) }) : t(hasPin ? "pin.open" : "pin.set");
+  const word = wait > 0 ? t("pin.wait", { count: Math.ceil(wait) }) : t(hasPin ? "pin.open" : "pin.set");
   return html`
     <form class="door card" @submit=${actions.enter}>
       <h2>${t(hasPin ? "pin.give" : "pin.choose")}</h2>
@@ -114,7 +113,7 @@ function overview(state, actions) {
           <p class="muted" id="source-why">${t("cal.source.why")}</p>
         </details>
         ${cal.unfinished.length
-          ? html`<p class="kept">${icon("done")} ${t("cal.unfinished", { n: cal.unfinished.length })}</p>`
+          ? html`<p class="kept">${icon("done")} ${t("cal.unfinished", { count: cal.unfinished.length })}</p>`
           : nothing}
         <button class="primary big" id="start" type="submit" aria-disabled=${busy || !ready || !by.trim()}>
           ${startWord(cal, by, busy)}

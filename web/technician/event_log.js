@@ -75,7 +75,7 @@ function view({ entries, warningsOnly, about, folders, message, error }, actions
     <p role="note">${message}</p>
     ${about ? html`<div class="row"><b>${t("event-log.about", { about })}</b>
       <button type="button" @click=${() => actions.showOnly(null)}>${t("event-log.all")}</button></div>` : nothing}
-    <p role="status">${entries && (shown.length ? t("event-log.count", { n: shown.length }) : t("event-log.empty"))}</p>
+    <p role="status">${entries && (shown.length ? t("event-log.count", { count: shown.length }) : t("event-log.empty"))}</p>
     <ol class="event-log">${shown.map((one) => entryItem(one, actions, about))}</ol>
   `;
 }

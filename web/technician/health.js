@@ -91,7 +91,7 @@ function view({ ok, checks }, large, speakRemedy) {
   return html`
     <h2>${t("health.title")}</h2>
     <div role="status" aria-atomic="false">
-      <p>${t(ok ? (unknown ? "health.notill" : "health.well") : "health.ill", { n: unknown })}</p>
+      <p>${t(ok ? (unknown ? "health.notill" : "health.well") : "health.ill", { count: unknown })}</p>
       ${ok ? nothing : html`<ul class="checks">${lines(false)}</ul>`}
     </div>
     <ul class="checks">

@@ -3,8 +3,7 @@
 
 import { buttonsChanged } from "../core/taps.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
-import { number, t } from "../i18n/translate.js";
-import { TECHNICIAN } from "../i18n/en_technician.js";
+import { has, number, t } from "../i18n/translate.js";
 
 const POLL_MS = 1000;
 const IN_PROGRESS = ["asked", "looking", "fetching", "installing", "restarting", "trying"];
@@ -144,8 +143,8 @@ const STAGES = {
 // unknown.
 function duration({ took_s: took }, guessS) {
   const minutes = (seconds) => Math.max(1, Math.ceil(seconds / 60));
-  const known = took ? t("update.took", { n: minutes(took) }) : "";
-  const guessed = guessS ? t("update.guess", { from: minutes(guessS[0]), n: minutes(guessS[1]) }) : "";
+  const known = took ? t("update.took", { count: minutes(took) }) : "";
+  const guessed = guessS ? t("update.guess", { from: minutes(guessS[0]), count: minutes(guessS[1]) }) : "";
   return html`<p>${known || guessed} ${t("update.itself")}</p>`;
 }
 
@@ -162,7 +161,7 @@ function errorBox(one) {
 
 // Return problem, remedy and the updater's message, which holds versions and numbers.
 function errorText({ code, message, remedy }) {
-  const known = `why.${code}` in TECHNICIAN;
+  const known = has(`why.${code}`);
   return html`<strong>${known ? t(`why.${code}`) : message}</strong> ${remedy} ${known ? html`<small>${message}</small>` : nothing}`;
 }
 
@@ -189,7 +188,7 @@ function choices(status, waiting, sent, actions) {
   const empty = status.looked && !status.found.length && status.state === "none" && !status.trouble;
   return html`
     ${empty ? headline("update.nothing") : nothing}
-    ${waiting ? html`<p id="unsent">${t("update.unsent", { n: waiting })} ${t("update.unsent.safe")}</p>` : nothing}
+    ${waiting ? html`<p id="unsent">${t("update.unsent", { count: waiting })} ${t("update.unsent.safe")}</p>` : nothing}
     ${status.found.length ? html`<ul class="checks">${status.found.map((one) => bundleItem(status, one, actions))}</ul>` : nothing}
     ${status.offered && !status.looked ? paragraph("update.offered", { version: status.offered }) : nothing}
     <p class="muted">${t("update.where")}</p>
@@ -206,7 +205,7 @@ function bundleItem(status, { id, where, stick, name, bytes, version, trouble: n
   return html`
     <li data-id=${id} data-code=${no?.code ?? "ok"}>
       <p><b>${version ? t("update.version", { version }) : name}</b></p>
-      <small>${place} · ${name} · ${t("update.megabytes", { n: number(bytes / 1e6, 0) })}</small>
+      <small>${place} · ${name} · ${t("update.megabytes", { count: number(bytes / 1e6, 0) })}</small>
       ${no
         ? html`<p class="bad">${errorText(no)}</p>`
         : html`${duration(status, guessS)} ${paragraph("update.power")}

@@ -60,6 +60,6 @@ const question = ({ captures }, actions) => html`<p><b>${t("stored.sure", { capt
 const buttons = ({ visits, undoable_captures: undoable, undoable_bytes: bytes }, actions) => html`<div class="row">
   ${visits ? html`<button class="primary" type="button" id="remove" @click=${actions.ask}>${t("stored.remove")}</button>` : nothing}
   ${undoable
-    ? html`<button type="button" id="undo-removal" @click=${actions.undo}>${t("stored.undo", { n: undoable, mb: megabytes(bytes) })}</button>`
+    ? html`<button type="button" id="undo-removal" @click=${actions.undo}>${t("stored.undo", { count: undoable, mb: megabytes(bytes) })}</button>`
     : nothing}
 </div>`;

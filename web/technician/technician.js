@@ -7,13 +7,12 @@ import { createStore } from "../core/store.js";
 import { buttonsChanged } from "../core/taps.js";
 import { render } from "../vendor/lit-html.js";
 import { technicianPage } from "./calibration_wizard.js";
-import { useLanguage, t } from "../i18n/translate.js";
-import { TECHNICIAN } from "../i18n/en_technician.js";
+import { loadLanguage, t } from "../i18n/translate.js";
 
 const POLL_MS = 700;
 const ACTIVITY_MS = 30_000; // at most one activity report in this time
 
-useLanguage("en", TECHNICIAN);
+await loadLanguage("en", "technician/en");
 
 const store = createStore(/** @type {Record<string, any>} */ ({
   view: "opening", // opening | door | overview | wizard | done | lenses | lens-result

@@ -3,8 +3,7 @@
 import { lensDrawing } from "./calibration_drawings.js";
 import { errorBox, icon, prompt } from "./page_parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { number, signed, t } from "../i18n/translate.js";
-import { TECHNICIAN } from "../i18n/en_technician.js";
+import { has, number, signed, t } from "../i18n/translate.js";
 
 // ---- card in the overview
 
@@ -159,7 +158,7 @@ export function lensResult({ cal }, actions) {
 function finding({ name, ok, value, limit, unit, remedy }) {
   const label = `lens.found.${name}`;
   return html`<li data-finding=${name} data-ok=${ok}>
-    <b>${ok ? t("lens.ok") : t("lens.fail")} ${label in TECHNICIAN ? t(label) : name}</b>
+    <b>${ok ? t("lens.ok") : t("lens.fail")} ${has(label) ? t(label) : name}</b>
     <span>${quantity(unit, value, signed)}</span>
     <small>${t("lens.limit", { limit: quantity(unit, limit, number) })}</small>
     ${ok ? nothing : html`<p class="bad">${remedy}</p>`}
