@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon.assessment.field_edge import FieldEdgeFit
+from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction.estimator import MIN_FREQUENCIES, RefractionEstimator, Search
-from device.recon.estimation.refraction.likelihood import noise_power
+from device.recon.estimation.refraction.likelihood import BandLikelihood, noise_power
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Linear
 from device.values import Image
@@ -107,23 +108,24 @@ class PsfMatchTest:
         if likelihood.bands.whole.where.size < MIN_FREQUENCIES:
             return None
         frame = likelihood.frame(counts, dark, refractor.defects(counts, dark))
-        if not likelihood.fit_smooth(frame, likelihood.model.stored) > 0:
+        smooth = likelihood.fit_smooth(frame, likelihood.model.stored)
+        if not smooth.level_dn > 0:
             return None
-        likelihood.residual(frame, 0.0)
-        noise = noise_power(likelihood.noise(frame), frame, likelihood.sample_weights)
+        relaxed = likelihood.residual(frame, smooth, transform(likelihood.geometry, 0.0))
+        noise = noise_power(likelihood.noise(frame, relaxed), frame)
 
-        def unlikelihood(m_dpt: float) -> float:
+        def found(m_dpt: float) -> BandLikelihood:
             between()
-            return likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.whole)
+            return likelihood.of_sphere(frame, smooth, noise, m_dpt)
 
-        search = Search(unlikelihood)
+        search = Search(lambda m_dpt: found(m_dpt).nats)
         sphere_dpt = search.descend(search.grid_search(refractor.step_dpt), refractor.step_dpt / 4)
-        unlikelihood(sphere_dpt)  # sets the |H|^2 of the band
-        score, sd = self._score(_filled(frame) - np.float32(likelihood.residual(frame, sphere_dpt)), noise)
+        stray_dn = likelihood.residual(frame, smooth, transform(likelihood.geometry, sphere_dpt)).stray_dn
+        score, sd = self._score(_filled(frame.linear) - np.float32(stray_dn), found(sphere_dpt).power, noise)
         if self._rim is None:
             return PsfMatchResult(score, sd, sphere_dpt, None, None)
         likelihood.model.refocus(likelihood.otf(likelihood.grid, sphere_dpt))
-        edge = self._rim.fit(frame.y, between)
+        edge = self._rim.fit(frame.linear.y, between)
         per_deg = refractor.geometry.px_per_deg / likelihood.grid.n
         return PsfMatchResult(
             score,
@@ -133,12 +135,12 @@ class PsfMatchTest:
             edge.radius_change_ratio,
         )
 
-    def _score(self, y: Image, noise: float) -> tuple[float, float]:
+    def _score(self, y: Image, psf_power: Image, noise: float) -> tuple[float, float]:
         band = self._likelihood.bands.whole
         fft = self._likelihood.fft
         np.multiply(y, self._likelihood.taper, out=fft.space)
         seen = np.abs(fft.forward().ravel()[band.where].astype(np.complex128)) ** 2
-        power = band.power.astype(np.float64)
+        power = psf_power.astype(np.float64)
         found = expected = certainty = 0.0
         for ring in self._rings:
             energy = seen[ring]

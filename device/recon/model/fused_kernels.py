@@ -269,7 +269,6 @@ def stretch_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, shar
 def negative_log_likelihood(
     seen: Spectrum,
     otf: Spectrum,
-    where: NDArray[np.int64],
     ring: NDArray[np.int64],
     s2: float,
     smear: float,
@@ -280,26 +279,25 @@ def negative_log_likelihood(
 ) -> float:
     """Return the negative log likelihood of a spectrum under S = q g + s2, with the best level g of each ring.
 
-    The result is sum(log S + |seen|^2 / S) in nats, NUMERICS.md 7.1. `otf` (H) belongs to the flat indices `where` of
-    `seen`, s2 is the noise. q = |H|^2 + smear (its mean over the ring), since a tapered window mixes frequencies.
+    The result is sum(log S + |seen|^2 / S) in nats, NUMERICS.md 7.1. `seen`, `otf` (H) and `ring` are (K,), s2 is the
+    noise. q = |H|^2 + smear (its mean over the ring), since a tapered window mixes frequencies.
     |seen|^2 is written to `energy`, q to `power`, g to `levels`; `repetitions` is the number of reweighted fits of g.
     """
     above = np.zeros(levels.size)
     below = np.zeros(levels.size)
-    cols = seen.shape[1]
-    for m in range(where.size):
-        f = seen[where[m] // cols, where[m] % cols]
+    for m in range(seen.size):
+        f = seen[m]
         h = otf[m]
         b = ring[m]
         energy[m] = f.real * f.real + f.imag * f.imag
         power[m] = h.real * h.real + h.imag * h.imag
         above[b] += power[m]
         below[b] += 1
-    for m in range(where.size):
+    for m in range(seen.size):
         power[m] += np.float32(smear * above[ring[m]] / below[ring[m]])
     for repetition in range(repetitions + 1):
         above[:], below[:] = 0, 0
-        for m in range(where.size):
+        for m in range(seen.size):
             b = ring[m]
             w = 1.0 if repetition == 0 else 1 / (power[m] * levels[b] + s2)
             above[b] += (energy[m] - s2) * power[m] * w * w
@@ -307,7 +305,7 @@ def negative_log_likelihood(
         for b in range(levels.size):
             levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * s2)
     total = 0.0
-    for m in range(where.size):
+    for m in range(seen.size):
         s = power[m] * levels[ring[m]] + s2
         total += np.log(s) + energy[m] / s
     return total

@@ -253,13 +253,13 @@ class CropModel:
 
 def detail_levels(edges: EdgeLikelihood, eye_dpt: Floats) -> tuple[Floats, Floats]:
     """Return mean frequency (cycles per sample) and level of the retina's detail of the first rings with detail."""
-    edges(eye_dpt)
+    levels = edges(eye_dpt).levels[:FITTED_RINGS]
     band = edges.band
-    count = edges.levels.size
+    count = band.rings
     sums = np.bincount(band.ring, np.hypot(band.rows, band.cols), count).astype(np.float64)
     frequency = sums / np.maximum(np.bincount(band.ring, minlength=count), 1)
-    is_known = edges.levels[:FITTED_RINGS] > MIN_LEVEL * edges.levels[:FITTED_RINGS].max()
-    return frequency[:FITTED_RINGS][is_known], edges.levels[:FITTED_RINGS][is_known]
+    is_known = levels > MIN_LEVEL * levels.max()
+    return frequency[:FITTED_RINGS][is_known], levels[is_known]
 
 
 def _cosines(size: int) -> Image:

@@ -1,10 +1,10 @@
 """Likelihood of an eye's refraction given one frame: the model that `estimator` searches over M.
 
-E(M) is defined in `estimator`. One object holds the plans of one calibration and sensor shape, and the state of the
-frame that `frame` and `fit_smooth` were called with last.
+E(M) is defined in `estimator`. One object holds the plans of one calibration and sensor shape. What is found of a frame
+is passed on as values, from `frame` by `fit_smooth` and `residual` to the likelihood.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -37,17 +37,16 @@ SMEAR = 0.1  # of a ring's mean |H|^2: leakage of the tapered window from neighb
 class Band:
     """The K frequencies of a search band; every array is (K,).
 
-    `where`: flat index into the window's rfft spectrum. `ring`: 0 to RINGS - 1. `rows`, `cols`: frequency in cycles per
-    sample. `share`: transfer of the n x n binning. `energy`, `power`: work arrays.
+    `where`: flat index into the window's rfft spectrum. `ring`: 0 to RINGS - 1; `rings`: their number up to the last
+    one with a frequency. `rows`, `cols`: frequency in cycles per sample. `share`: transfer of the n x n binning.
     """
 
     where: NDArray[np.int64]
     ring: NDArray[np.int64]
+    rings: int
     rows: NDArray[np.float64]
     cols: NDArray[np.float64]
     share: Image
-    energy: Image
-    power: Image
 
     @classmethod
     def of(cls, window: Pair, low: float, high: float, n: int) -> "Band":
@@ -64,13 +63,12 @@ class Band:
         rows = down[where // across.size]
         cols = across[where % across.size]
         share = (dirichlet(rows, n) * dirichlet(cols, n)).astype(np.float32)
-        scratch = (np.zeros(where.size, np.float32) for _ in range(2))
-        return cls(where, ring, rows, cols, share, *scratch)
+        return cls(where, ring, int(ring.max(initial=0)) + 1, rows, cols, share)
 
 
 @dataclass(frozen=True)
 class SearchBands:
-    """Frequencies of the search: the band `whole` with the fine structure of |H|^2, and its `upper` half.
+    """Frequencies of the search: the band `whole` with the fine structure of |H|^2.
 
     `low` and `high` limit the band, cycles per sample. `stopband` holds the flat indices into the window's rfft
     spectrum of the quarter with the lowest |H|^2.
@@ -79,7 +77,6 @@ class SearchBands:
     low: float
     high: float
     whole: Band
-    upper: Band
     stopband: NDArray[np.int64]
 
     @classmethod
@@ -91,28 +88,76 @@ class SearchBands:
         power = np.abs(interpolated_otf.on_grid(window, n, np.eye(2)).astype(np.complex128)) ** 2
         low, high = band(frequency, power, min(window))
         whole = Band.of(window, low, high, n)
-        middle = float(np.median(frequency.ravel()[whole.where])) if whole.where.size else high
-        return cls(
-            low, high, whole, Band.of(window, middle, high, n), np.flatnonzero(power <= np.quantile(power, 0.25))
-        )
+        return cls(low, high, whole, np.flatnonzero(power <= np.quantile(power, 0.25)))
 
 
 @dataclass(frozen=True)
-class GapTreatment:
-    """Treatment of the missing samples of one frame, each array of the window's shape.
+class SampledFrame:
+    """A frame on the model's samples with their weights; each array has the window's shape.
 
-    `weights` is the window's taper, which also falls to 0 at wide gaps. `narrow` marks the samples of narrow gaps,
-    `filling` is the detail that is continued into them; both are None for a frame without gaps.
+    `taper` is the window's, which also falls to 0 at wide gaps; `weights` the good share of each sample times it;
+    `known` the taper, 0 in the narrow gaps, which `narrow` marks (None for a frame without gaps).
     """
 
+    linear: Linear
+    taper: Image
     weights: Image
+    known: Image
     narrow: Mask | None = None
+
+
+@dataclass(frozen=True)
+class SmoothPart:
+    """Smooth part of a frame's object before the blur, as residuals subtract it.
+
+    `spectrum`: that of the object on the grid; `level_dn`: its mean level. `filling`: detail of the frame continued
+    into its narrow gaps, of the window's shape; None without such gaps.
+    """
+
+    spectrum: Spectrum
+    level_dn: float
     filling: Image | None = None
 
-    @property
-    def known_weights(self) -> Image:
-        """The weights, 0 in the narrow gaps."""
-        return self.weights if self.narrow is None else self.weights * ~self.narrow
+
+@dataclass(frozen=True)
+class Residual:
+    """Tapered spectrum of a frame minus its smooth part through a candidate's PSF.
+
+    `spectrum` is the array of the FFT: it holds until the next transform. `otf` is the candidate's on the grid: it
+    holds until the next residual. `level` is the scale of the smooth part, `stray_dn` the constant stray light.
+    """
+
+    spectrum: Spectrum
+    otf: Spectrum
+    level: float
+    stray_dn: float
+
+
+@dataclass(frozen=True)
+class BandLikelihood:
+    """Negative log likelihood of a residual over a band, under S = g q + s2 with the best level g of each ring.
+
+    `nats` is the likelihood up to a constant, `levels` holds g, (rings,). For each frequency, (K,): `energy` is |R|^2,
+    `power` is q (|H|^2 + SMEAR times its ring mean), `model` is S.
+    """
+
+    nats: float
+    levels: NDArray[np.float64]
+    energy: Image
+    power: Image
+    model: Image
+
+
+def band_likelihood(rest: Spectrum, otf: Spectrum, band: Band, noise_dn2: float) -> BandLikelihood:
+    """Return the likelihood of a residual `rest` through a PSF `otf`, both (K,), for the noise s2 of a frequency."""
+    levels = np.zeros(band.rings)
+    energy = np.empty(rest.size, np.float32)
+    power = np.empty(rest.size, np.float32)
+    nats = fused_kernels.negative_log_likelihood(
+        rest, otf, band.ring, noise_dn2, SMEAR, REPETITIONS, levels, energy, power
+    )
+    model = np.asarray(power * levels[band.ring] + noise_dn2, np.float32)
+    return BandLikelihood(nats, levels, energy, power, model)
 
 
 class RefractionLikelihood:
@@ -137,11 +182,7 @@ class RefractionLikelihood:
         self.fft: RealFft = planner.plan(window)
         self.taper = taper(window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(window))))
         self.bands = SearchBands.of(window, n, self.interpolated_otf)
-        self._levels = np.zeros(RINGS)
-        self._smooth: Image = np.zeros(self.grid.shape, np.float32)
-        self._object, self._otf = (np.zeros(self.model.otf.shape, np.complex64) for _ in range(2))
-        self.sample_weights = np.zeros(window, np.float32)
-        self._gaps = GapTreatment(self.taper)
+        self._otf = np.zeros(self.model.otf.shape, np.complex64)
 
     @property
     def grid(self) -> Grid:
@@ -156,126 +197,109 @@ class RefractionLikelihood:
     def _shading(self) -> Shading:
         return Shading(self.model)
 
-    def frame(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
-        """Return the frame on this model's samples, and set `sample_weights`: good share times taper, per sample."""
-        frame = self._preparer(counts, dark, defects)
-        self._gaps = GapTreatment(self.taper)
-        if frame.has_gaps:
-            gap = frame.good < MIN_GOOD
-            wide = ndimage.binary_opening(gap, np.ones((WIDE_SAMPLES, WIDE_SAMPLES), np.bool_))
-            near = np.minimum(1, ndimage.distance_transform_edt(~wide) / RAMP_SAMPLES) if wide.any() else 1.0
-            weights = (self.taper * (0.5 - 0.5 * np.cos(np.pi * near))).astype(np.float32)
-            self._gaps = GapTreatment(weights, gap & ~wide)
-        np.multiply(frame.good, self._gaps.weights, out=self.sample_weights)
-        return frame
+    def frame(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> SampledFrame:
+        """Return the frame on this model's samples, with the weight of each."""
+        linear = self._preparer(counts, dark, defects)
+        if not linear.has_gaps:
+            return SampledFrame(linear, self.taper, linear.good * self.taper, self.taper)
+        gap = linear.good < MIN_GOOD
+        wide = ndimage.binary_opening(gap, np.ones((WIDE_SAMPLES, WIDE_SAMPLES), np.bool_))
+        near = np.minimum(1, ndimage.distance_transform_edt(~wide) / RAMP_SAMPLES) if wide.any() else 1.0
+        taper = (self.taper * (0.5 - 0.5 * np.cos(np.pi * near))).astype(np.float32)
+        narrow = gap & ~wide
+        return SampledFrame(linear, taper, linear.good * taper, taper * ~narrow, narrow)
 
-    def fit_smooth(self, frame: Linear, otf: Spectrum) -> float:
-        """Set the model's OTF, fit the smooth object (before the blur) to the frame, and keep its spectrum.
-
-        The spectrum is used by `residual`. Return the mean level in DN.
-        """
+    def fit_smooth(self, frame: SampledFrame, otf: Spectrum) -> SmoothPart:
+        """Return the smooth part that fits a frame through an OTF on the grid."""
         self.model.refocus(otf)
         self._shading.refocus()
         smooth = np.zeros(self.grid.shape, np.float32)
-        level, stray = self._shading.fit(frame, smooth)
-        self.set_smooth(frame, smooth, stray, otf)
-        return level
+        level, stray = self._shading.fit(frame.linear, smooth)
+        return self.smooth_part(frame, smooth, otf, level, stray)
 
-    def set_smooth(self, frame: Linear, smooth: Image, stray: float, otf: Spectrum) -> None:
-        """Set the smooth object (grid, before the blur by `otf`) that `residual` subtracts; `stray` is in DN.
+    def smooth_part(
+        self, frame: SampledFrame, smooth: Image, otf: Spectrum, level_dn: float, stray_dn: float
+    ) -> SmoothPart:
+        """Return a smooth object (grid, before the blur by `otf`) as residuals of the frame subtract it.
 
-        The detail of the frame is continued into narrow gaps.
+        `stray_dn` is the stray light beside it. The detail of the frame is continued into its narrow gaps.
         """
-        self.model.otf, self._smooth = otf, smooth
-        self._object = self.object_spectrum(smooth)
-        if self._gaps.narrow is not None:
-            self._fill_narrow_gaps(frame, stray, self._gaps.narrow)
+        spectrum = self.object_spectrum(smooth)
+        if frame.narrow is None:
+            return SmoothPart(spectrum, level_dn)
+        self.model.otf = otf
+        seen = self.model.blur(smooth)[self.grid.slices] + np.float32(stray_dn)
+        return SmoothPart(spectrum, level_dn, _filling(frame, seen, frame.narrow))
 
     def object_spectrum(self, image: Image) -> Spectrum:
         """Return the spectrum of an object on the grid as a new array."""
         self.model.fft.space[:] = image
         return self.model.fft.forward().copy()
 
-    def _fill_narrow_gaps(self, frame: Linear, stray: float, narrow: Mask) -> None:
-        """Set the filling of the gaps to the detail around narrow gaps, continued into them; 0 elsewhere.
-
-        Wide gaps are tapered like the window. A gap of zeros has an edge with power at every frequency, which would be
-        attributed to the retina.
-        """
-        smooth = self.model.blur(self._smooth)[self.grid.slices] + np.float32(stray)
-        known = (frame.good >= MIN_GOOD).astype(np.float32)
-        detail = ndimage.gaussian_filter((frame.y - smooth) * known, FADE_SAMPLES)
-        share = ndimage.gaussian_filter(known, FADE_SAMPLES)
-        filling = (narrow * self._gaps.weights * detail / np.maximum(share, 0.1)).astype(np.float32)
-        self._gaps = replace(self._gaps, filling=filling)
-
-    def residual(self, frame: Linear, m_dpt: float) -> float:
-        """Write the tapered spectrum of the frame minus its smooth part through the candidate's PSF to `fft.spectrum`.
-
-        Return the constant stray light in DN.
-        """
-        return self.residual_of(frame, transform(self.geometry, m_dpt))[1]
-
-    def residual_of(self, frame: Linear, stretch: Transform) -> tuple[float, float]:
-        """Do as `residual` for the eye with this stretch of the PSF; return the scale of the smooth part and the stray
-        light in DN.
-        """
+    def residual(self, frame: SampledFrame, smooth: SmoothPart, stretch: Transform) -> Residual:
+        """Return what the smooth part through the PSF of an eye, with this stretch, leaves of a frame."""
         grid = self.grid
-        self.interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
-        smooth = self._seen(self._object)
-        level, stray = flat_fit(kernels.flat_fit_sums(frame.y, smooth, frame.good))
-        kernels.residual(frame.y, smooth, self._gaps.known_weights, level, stray, (0, 0), self.fft.space)
-        if self._gaps.filling is not None:
-            self.fft.space += self._gaps.filling
-        self.fft.forward()
-        return level, stray
+        linear = frame.linear
+        otf = self.interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
+        seen = self._seen(smooth.spectrum, otf)
+        level, stray_dn = flat_fit(kernels.flat_fit_sums(linear.y, seen, linear.good))
+        kernels.residual(linear.y, seen, frame.known, level, stray_dn, (0, 0), self.fft.space)
+        if smooth.filling is not None:
+            self.fft.space += smooth.filling
+        return Residual(self.fft.forward(), otf, level, stray_dn)
 
-    def spectrum_of(self, part: Spectrum) -> Spectrum:
-        """Return the tapered spectrum of an object (its spectrum on the grid) through the PSF of the last residual."""
-        np.multiply(self._seen(part), self._gaps.known_weights, out=self.fft.space)
+    def spectrum_of(self, part: Spectrum, otf: Spectrum, frame: SampledFrame) -> Spectrum:
+        """Return the tapered spectrum of an object (its spectrum on the grid) through an OTF on the grid.
+
+        It is the array of the FFT.
+        """
+        np.multiply(self._seen(part, otf), frame.known, out=self.fft.space)
         return self.fft.forward()
 
-    def _seen(self, part: Spectrum) -> Image:
+    def _seen(self, part: Spectrum, otf: Spectrum) -> Image:
         """Return the blurred object in the window, in the units of the FFT without its scale."""
         fft = self.model.fft
-        np.multiply(part, self._otf, out=fft.spectrum)
+        np.multiply(part, otf, out=fft.spectrum)
         return fft.inverse()[self.grid.slices]
 
-    def negative_log_likelihood(self, frame: Linear, noise_dn2: float, m_dpt: float, part: Band) -> float:
-        """Return the negative log likelihood (nats, up to a constant) of the candidate M over `part` of the band.
+    def at_band(self, residual: Residual, stretch: Transform) -> tuple[Spectrum, Spectrum]:
+        """Return the residual and the OTF of its eye at the frequencies of the band, (K,) each."""
+        band = self.bands.whole
+        otf = self.interpolated_otf.at_frequencies(band.rows, band.cols, band.share, self.grid.n, stretch)
+        return residual.spectrum.ravel()[band.where], otf
 
-        `frame` must come from `self.frame`, and `fit_smooth` must have been called with it. R is the spectrum of
-        `residual`. Write |H|^2 + SMEAR times its ring mean to `part.power`, |R|^2 to `part.energy`, and R to
-        `fft.spectrum`.
-        """
-        self.residual(frame, m_dpt)
+    def of_sphere(self, frame: SampledFrame, smooth: SmoothPart, noise_dn2: float, m_dpt: float) -> BandLikelihood:
+        """Return the likelihood of the candidate M; `noise_dn2` is the noise of a frequency."""
         stretch = transform(self.geometry, m_dpt)
-        otf = self.interpolated_otf.at_frequencies(part.rows, part.cols, part.share, self.grid.n, stretch)
-        return fused_kernels.negative_log_likelihood(
-            self.fft.spectrum,
-            otf,
-            part.where,
-            part.ring,
-            noise_dn2,
-            SMEAR,
-            REPETITIONS,
-            self._levels,
-            part.energy,
-            part.power,
-        )
+        rest, otf = self.at_band(self.residual(frame, smooth, stretch), stretch)
+        return band_likelihood(rest, otf, self.bands.whole, noise_dn2)
 
-    def noise(self, frame: Linear) -> Noise:
+    def noise(self, frame: SampledFrame, residual: Residual) -> Noise:
         """Return the noise of a sample of the frame.
 
         It comes from the sensor's gain, or, if that is unknown, from the quarter of the frequencies with the lowest
-        |H|^2 in the spectrum of the last `residual`.
+        |H|^2 in the spectrum of a residual.
         """
-        stopband_power = np.abs(self.fft.spectrum.ravel()[self.bands.stopband].astype(np.complex128)) ** 2
-        weight = float(np.vdot(self.sample_weights, self.sample_weights))
-        return Noise.of(self.sensor, self.grid.n, float(np.median(stopband_power)) / np.log(2) / weight, frame.mean_dn)
+        stopband_power = np.abs(residual.spectrum.ravel()[self.bands.stopband].astype(np.complex128)) ** 2
+        weight = float(np.vdot(frame.weights, frame.weights))
+        seen_dn2 = float(np.median(stopband_power)) / np.log(2) / weight
+        return Noise.of(self.sensor, self.grid.n, seen_dn2, frame.linear.mean_dn)
 
 
-def noise_power(noise: Noise, frame: Linear, weights: Image) -> float:
-    """Return the noise power per frequency of the DFT of a frame's window with weights, in DN^2."""
-    squared = np.square(weights, dtype=np.float64)
-    return max(noise.per_dn * float((squared * frame.y).sum()) + noise.floor_dn2 * float(squared.sum()), 1e-20)
+def _filling(frame: SampledFrame, smooth: Image, narrow: Mask) -> Image:
+    """Return the detail around narrow gaps, continued into them, 0 elsewhere; `smooth`: smooth part in the window.
+
+    Wide gaps are tapered like the window. A gap of zeros has an edge with power at every frequency, which would be
+    attributed to the retina.
+    """
+    known = (frame.linear.good >= MIN_GOOD).astype(np.float32)
+    detail = ndimage.gaussian_filter((frame.linear.y - smooth) * known, FADE_SAMPLES)
+    share = ndimage.gaussian_filter(known, FADE_SAMPLES)
+    filling: Image = (narrow * frame.taper * detail / np.maximum(share, 0.1)).astype(np.float32)
+    return filling
+
+
+def noise_power(noise: Noise, frame: SampledFrame) -> float:
+    """Return the noise power per frequency of the DFT of a frame's window with its weights, in DN^2."""
+    squared = np.square(frame.weights, dtype=np.float64)
+    return max(noise.per_dn * float((squared * frame.linear.y).sum()) + noise.floor_dn2 * float(squared.sum()), 1e-20)
