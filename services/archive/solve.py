@@ -4,7 +4,6 @@ Nothing here needs Dask: a bare process computes the same bytes.
 """
 
 import shutil
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,6 +29,7 @@ from services.archive.result import (
     encoded_document,
 )
 from services.imaging.raw_metadata import RawMetadata
+from services.lru_cache import LruCache
 from services.research.montage_files import read_picture
 from services.research.pair_scores import PairScorer
 from services.research.reconstruct_capture import (
@@ -119,7 +119,7 @@ class Solvers:
         self._calibrations = calibrations
         self._clock = clock or SystemClock()
         self._planner = Planner(None, effort=EFFORT)
-        self._kept: OrderedDict[tuple[str, str], CaptureReconstructor] = OrderedDict()
+        self._kept = LruCache[tuple[str, str], CaptureReconstructor](KEPT_SOLVERS)
 
     def solve(self, task: Task, results: ResultFolder, worker: str) -> Outcome:
         """Reconstruct a capture and store its result; a result that is there already stays.
@@ -175,18 +175,16 @@ class Solvers:
 
     def _solver(self, task: Task) -> CaptureReconstructor:
         key = task.calibration.digest, digest_of(task.settings.model_dump())  # a worker may outlive a plan
-        if key not in self._kept:
-            options = self._calibrations.options(task.calibration, task.settings)
-            of_colours: dict[Colour, ReconstructOptions] = {
-                colour: replace(options, psfs=paths)
-                for colour, role in COLOUR_ROLES.items()
-                if (paths := self._calibrations.paths(task.calibration, role))
-            }
-            self._kept[key] = CaptureReconstructor(options, self._planner, of_colours)
-            while len(self._kept) > KEPT_SOLVERS:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        return self._kept.get_or_make(key, lambda: self._planned(task))
+
+    def _planned(self, task: Task) -> CaptureReconstructor:
+        options = self._calibrations.options(task.calibration, task.settings)
+        of_colours: dict[Colour, ReconstructOptions] = {
+            colour: replace(options, psfs=paths)
+            for colour, role in COLOUR_ROLES.items()
+            if (paths := self._calibrations.paths(task.calibration, role))
+        }
+        return CaptureReconstructor(options, self._planner, of_colours)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Values of one capture: its request with an idempotency key, its exposed frames, its report and its files."""
 
 import json
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from services.imaging import picture_files
 from services.imaging.colour_rendering import render_colour
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.press_exposure import Exposure
+from services.lru_cache import LruCache
 from services.records.blobs import FileContent, WrittenFile
 from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, PictureVerdict
 from services.records.capture_journal import InterruptedCapture
@@ -109,7 +109,7 @@ class IdempotencyKeys:
     """Latest presses by idempotency key. Not thread-safe: the mutex of `ExamRequests` guards it."""
 
     def __init__(self) -> None:
-        self._presses: OrderedDict[str, Press] = OrderedDict()
+        self._presses = LruCache[str, Press](REMEMBERED)
 
     def find(self, key: str | None, eye: Eye, target: CaptureTarget) -> Future[Capture] | None:
         """Return the future of the press with this key, or None; IdempotencyKeyConflict for another target."""
@@ -122,10 +122,8 @@ class IdempotencyKeys:
         return press.future
 
     def remember(self, key: str, press: Press) -> None:
-        """Store a press under its key; drop the oldest press if more than REMEMBERED are stored."""
-        self._presses[key] = press
-        while len(self._presses) > REMEMBERED:
-            self._presses.popitem(last=False)
+        """Store a press under its key, in place of the one whose key was not used for longest beyond REMEMBERED."""
+        self._presses.put(key, press)
 
 
 def frame_metadata(capture: RawMetadata, frame: Frame) -> RawMetadata:

@@ -7,7 +7,6 @@ corrected eye gives another montage, and the removal of a picture needs no furth
 
 import hashlib
 import logging
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from threading import Condition, Thread
@@ -18,6 +17,7 @@ from device.recon.montage import Placement, make_montage
 from device.values import Eye
 from services.imaging.picture_files import read_png, to_png
 from services.instrument.background import run_in_subprocess
+from services.lru_cache import LruCache
 from services.records.capture import NO_METHOD
 from services.records.capture_store import CaptureStore
 from services.records.protocol import Protocol
@@ -80,8 +80,8 @@ class MontageMaker:
     def __init__(self, store: CaptureStore, is_idle: Callable[[], bool], px_per_deg: float | None) -> None:
         self._store, self._is_idle, self._px_per_deg = store, is_idle, px_per_deg
         self._lock = Condition()
-        self._waiting: OrderedDict[str, tuple[VisitPicture, ...]] = OrderedDict()
-        self._kept: OrderedDict[str, JoinedPictures | DiffuscopeError] = OrderedDict()
+        self._waiting: dict[str, tuple[VisitPicture, ...]] = {}
+        self._kept = LruCache[str, JoinedPictures | DiffuscopeError](MAX_KEPT)
         self._is_busy = self._is_closed = False
 
     def montage(self, visit: Visit, protocol: Protocol, eye: Eye) -> VisitMontage:
@@ -98,7 +98,6 @@ class MontageMaker:
             if known is None:
                 self._request(digest, pictures)
                 return VisitMontage(pictures, digest, "computing")
-            self._kept.move_to_end(digest)
         if isinstance(known, DiffuscopeError):
             return VisitMontage(pictures, digest, "failed", problem=known)
         return VisitMontage(pictures, digest, "apart" if known.png is None else "joined", known)
@@ -127,8 +126,8 @@ class MontageMaker:
         if self._is_closed:
             return
         self._waiting.setdefault(digest, pictures)
-        while len(self._waiting) > MAX_WAITING:  # the screen that asked for it asks again
-            self._waiting.popitem(last=False)
+        if len(self._waiting) > MAX_WAITING:  # the screen that asked for it asks again
+            del self._waiting[next(iter(self._waiting))]
         if not self._is_busy:
             self._is_busy = True
             Thread(target=self._run, name="montage", daemon=True).start()
@@ -153,9 +152,7 @@ class MontageMaker:
             with self._lock:
                 self._waiting.pop(digest, None)
                 if not self._is_closed:
-                    self._kept[digest] = made
-                while len(self._kept) > MAX_KEPT:
-                    self._kept.popitem(last=False)
+                    self._kept.put(digest, made)
 
     def _computed(self, pictures: Sequence[VisitPicture]) -> JoinedPictures:
         content = [self._store.read(one.capture, PICTURE) for one in pictures]

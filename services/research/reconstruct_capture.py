@@ -6,7 +6,7 @@ The solvers are those of a press (`device.recon.burst_reconstructor`, `colour_re
 each calibration, frame shape and set of levels, so that many captures of one head follow each other at little cost.
 """
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -25,6 +25,7 @@ from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
 from device.recon.white_balance import light_dn_per_s
 from device.values import Calibration, ChannelUse, Colour, FrameUse, Image, Psf, Reconstruction, Report
+from services.lru_cache import LruCache
 from services.research.burst_frames import common_raw, refuse_other_size, rejections, unusable_raws, without_bad
 from services.research.reconstruct_file import (
     FileReconstruction,
@@ -154,7 +155,7 @@ class CaptureReconstructor:
         self._planner = planner or Planner(options.plans)
         self._single = FileReconstructor(options, self._planner)
         self._of_colours = of_colours or {}
-        self._plans: OrderedDict[tuple[object, ...], _CaptureSolvers] = OrderedDict()
+        self._plans = LruCache[tuple[object, ...], _CaptureSolvers](KEPT_PLANS)
 
     def __call__(self, frames: CaptureFrames) -> CaptureReconstruction:
         """Return the picture of a capture; FrameError or PsfError for frames that cannot be solved."""
@@ -203,13 +204,12 @@ class CaptureReconstructor:
         index = most_likely_psf(reference, common.raw.pixels, self._planner)[0] if len(reference.psfs) > 1 else 0
         counts = tuple((name, len(given) > 1, _levels(others[name])) for name, given in sorted(frames.colours.items()))
         key = common.solved_shape, _levels(common), len(frames.lit) > 1, frames.light, index, counts
-        if key not in self._plans:
+
+        def plan() -> _CaptureSolvers:
             calibrations = {name: self._of_colour(name, one, whole, reference) for name, one in others.items()}
-            self._plans[key] = _CaptureSolvers(self._options, reference, calibrations, frames, self._planner, index)
-            while len(self._plans) > KEPT_PLANS:
-                self._plans.popitem(last=False)
-        self._plans.move_to_end(key)
-        return self._plans[key], notes
+            return _CaptureSolvers(self._options, reference, calibrations, frames, self._planner, index)
+
+        return self._plans.get_or_make(key, plan), notes
 
     def _of_colour(
         self, name: Colour, loaded: LoadedRaw, whole: Calibration, reference: Calibration

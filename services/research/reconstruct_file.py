@@ -6,7 +6,6 @@
 import errno
 import json
 import os
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -34,6 +33,7 @@ from device.recon.solvers.flat_field_correction import flat_field_correct
 from device.values import Calibration, Image, Reconstruction, Report
 from services.imaging.colour_rendering import render_colour
 from services.imaging.picture_files import DISPLAY, to_png
+from services.lru_cache import LruCache
 from services.research import sweep_plot
 from services.research.reconstruct_inputs import (
     LoadedPsfs,
@@ -159,7 +159,7 @@ class FileReconstructor:
         self._options = options
         self._planner = planner or Planner(options.plans)
         self._psfs: dict[tuple[Shape, int, str | None], LoadedPsfs | None] = {}
-        self._plans: OrderedDict[tuple[object, ...], _FrameSolvers] = OrderedDict()
+        self._plans = LruCache[tuple[object, ...], _FrameSolvers](KEPT_PLANS)
         self._last: _FrameSolvers | None = None
 
     def __call__(self, source: RawSource, dark: Source | None = None) -> FileReconstruction:
@@ -227,14 +227,13 @@ class FileReconstructor:
         bad = raw.bad.tobytes() if raw.bad.any() else b""
         levels = (raw.white_dn, raw.shift, raw.stored_bits, loaded.black_dn, loaded.simulated, loaded.light, bad)
         key = (loaded.shape, loaded.channels, loaded.bayer, *levels)
-        if key not in self._plans:
+
+        def plan() -> _FrameSolvers:
             calibrations = load_calibrations(self._options, loaded, psfs)
             is_mosaic = loaded.bayer is not None
-            self._plans[key] = _FrameSolvers(self._options, calibrations, loaded.solved_shape, self._planner, is_mosaic)
-            while len(self._plans) > KEPT_PLANS:
-                self._plans.popitem(last=False)
-        self._plans.move_to_end(key)
-        return self._plans[key]
+            return _FrameSolvers(self._options, calibrations, loaded.solved_shape, self._planner, is_mosaic)
+
+        return self._plans.get_or_make(key, plan)
 
 
 class _FrameSolvers:
