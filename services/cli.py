@@ -27,7 +27,7 @@ from services.running_time import announced, say, working
 
 if TYPE_CHECKING:
     from services.research.reconstruct_burst import ChannelSource
-    from services.research.reconstruct_file import FileReconstruction
+    from services.research.reconstruct_file import FileReconstruction, OutputFiles
     from services.research.reconstruct_inputs import ReconstructOptions
 
 GROUPS = {
@@ -203,33 +203,30 @@ def reconstruct(
     With --each one picture of every frame of a recording; with --channel one colour picture.
     """
     from services.research.psf_stack import psf_stack
-    from services.research.reconstruct_file import parse_bayer, parse_settings, write_or_raise
+    from services.research.reconstruct_file import OutputFiles, parse_bayer, parse_settings, write_or_raise
     from services.research.reconstruct_inputs import ReconstructOptions
 
     channels = parse_channels(channel or [], calibration is not None)
     raws = raw or []
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
-        raws[0] if raws else Path(),
-        psf_stack(psf or ()),
-        None if each else output,
-        method,
-        budget_s,
-        common_dark,
-        flat,
-        head and head_file(head),
-        field_deg,
-        even,
-        resources.fft_plans(),
-        None if each else report,
-        sweep,
-        calibration,
-        bin,
-        rounds,
-        parse_settings(setting or ()),
-        parse_bayer(bayer),
-        field_fixed,
-        not no_refraction,
+        psfs=psf_stack(psf or ()),
+        method=method,
+        budget_s=budget_s,
+        dark=common_dark,
+        flat=flat,
+        head=head and head_file(head),
+        field_deg=field_deg,
+        even=even,
+        plans=resources.fft_plans(),
+        sweep=sweep,
+        calibration=calibration,
+        bin=bin,
+        rounds=rounds,
+        settings=parse_settings(setting or ()),
+        bayer=parse_bayer(bayer),
+        field_fixed=field_fixed,
+        refraction=not no_refraction,
     )
     refuse_mixed(raws, channels, darks, each)
     with working("reconstructing") as beat:
@@ -238,7 +235,7 @@ def reconstruct(
 
             failed = reconstruct_each(raws, options, output, report, typer.echo, say)
             raise typer.Exit(1 if failed else 0)
-        made = _reconstructed(raws, channels, darks, options)
+        made = _reconstructed(raws, channels, darks, options, OutputFiles(output, report))
     if report is not None:
         write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
     typer.echo(f"{output}: {made.summary}; {beat.spent}")
@@ -247,15 +244,21 @@ def reconstruct(
 
 
 def _reconstructed(
-    raws: list[Path], channels: "list[ChannelSource]", darks: dict[str, Path], options: "ReconstructOptions"
+    raws: list[Path],
+    channels: "list[ChannelSource]",
+    darks: dict[str, Path],
+    options: "ReconstructOptions",
+    output: "OutputFiles",
 ) -> "FileReconstruction":
     if len(raws) == 1 and not channels:
         from services.research.reconstruct_file import reconstruct_file
 
-        return reconstruct_file(options)
+        return reconstruct_file(raws[0], options, output)
     from services.research.reconstruct_burst import reconstruct_burst, reconstruct_colours
 
-    return reconstruct_colours(channels, options, darks) if channels else reconstruct_burst(raws, options)
+    if channels:
+        return reconstruct_colours(channels, options, darks, output)
+    return reconstruct_burst(raws, options, output)
 
 
 @app.command()

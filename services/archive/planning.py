@@ -24,7 +24,7 @@ from services.archive.sources import (
     find_captures,
     is_store,
 )
-from services.research.reconstruct_file import refuse_invalid
+from services.research.reconstruct_file import refuse_invalid_settings
 from services.research.reconstruct_inputs import ReconstructOptions
 
 STEP = 500  # captures between two lines of progress
@@ -156,19 +156,6 @@ def _refuse_settings(settings: PlanSettings) -> None:
     """Raise SettingError for settings that contradict each other, or that the solver refuses."""
     if settings.rounds is not None and settings.budget_s is not None:
         raise SettingError("rounds and seconds limit the same", "Give --rounds or --budget-s, not both.")
-    refuse_invalid(
-        ReconstructOptions(
-            Path(),
-            (Path(),),
-            None,
-            settings.method,
-            settings.budget_s,
-            None,
-            None,
-            None,
-            None,
-            False,
-            None,
-            rounds=settings.rounds,
-        )
+    refuse_invalid_settings(
+        ReconstructOptions(method=settings.method, budget_s=settings.budget_s, rounds=settings.rounds)
     )

@@ -82,17 +82,11 @@ class CalibrationFiles:
         """Return the options of a reconstruction with the local copies of a calibration."""
         place = self._root / calibration.digest
         return ReconstructOptions(
-            raw=Path(),
             psfs=self.paths(calibration, "psf"),
-            output=None,
             method=settings.method,
             budget_s=settings.budget_s,
             dark=next(iter(self.paths(calibration, "dark")), None),
             flat=next(iter(self.paths(calibration, "flat")), None),
-            head=None,
-            field_deg=None,
-            even=False,
-            plans=None,
             rounds=settings.rounds,
             calibration=f"{place}:{calibration.id}" if calibration.id else None,
         )

@@ -17,7 +17,7 @@ import pyfftw
 
 from device.clock import Clock, Deadline, SystemClock
 from device.config.head_file import InstrumentSpec, load_head
-from device.config.image_files import Raw, read_image
+from device.config.image_files import read_image
 from device.errors import DiffuscopeError, FrameError, SettingError
 from device.recon.assessment.metrics import FIT, RANGE, PictureScorer, Scores, shift_px
 from device.recon.installed_methods import available_methods, find_method
@@ -545,7 +545,6 @@ def recorded_case(
             f"the raw {frame.shape[0]} x {frame.shape[1]}",
             "Give the truth on the sensor's grid: one value per pixel of the raw frame.",
         )
-    file = raw.pixels if isinstance(raw, Raw) else raw
-    options = ReconstructOptions(file, (psf,), None, None, None, None, None, head, field_deg, False, plans)
+    options = ReconstructOptions(psfs=(psf,), head=head, field_deg=field_deg, plans=plans)
     name = raw.name if isinstance(raw, Path) else frame.name
     return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame), True, notes=frame.notes)

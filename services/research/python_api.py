@@ -551,16 +551,13 @@ def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOpti
     flat = given.get("flat")
     psfs = psf if isinstance(psf, list | tuple) else (psf,)
     return ReconstructOptions(
-        raw=Path(),
         psfs=psf_stack([_source(one) for one in psfs]),
-        output=None,
         method=given.get("method"),
         budget_s=given.get("budget_s"),
         dark=None if dark is None else _source(dark),
         flat=None if flat is None else _source(flat),
         head=_head(given.get("head")),
         field_deg=given.get("field_deg"),
-        even=False,
         plans=resources.fft_plans(),
         bin=given.get("bin"),
         rounds=given.get("rounds"),

@@ -22,9 +22,10 @@ from services.research.reconstruct_capture import (
     frames_of_capture,
 )
 from services.research.reconstruct_file import (
+    NO_FILES,
     FileReconstruction,
-    refuse_output,
-    refuse_overwriting,
+    OutputFiles,
+    refuse_outputs,
     write_picture,
 )
 from services.research.reconstruct_inputs import ReconstructOptions, Source, name_of, stated_light
@@ -39,34 +40,42 @@ class ChannelSource:
     psf: Source | None = None
 
 
-def reconstruct_burst(raws: Sequence[Source], options: ReconstructOptions) -> FileReconstruction:
+def reconstruct_burst(
+    raws: Sequence[Source], options: ReconstructOptions, output: OutputFiles = NO_FILES
+) -> FileReconstruction:
     """Reconstruct one picture from the raws of a burst, on the grid of the first one, and write it.
 
-    `options` holds all other options (`raw` is ignored). The report's `frames` says what became of each raw. FrameError
-    for raws of different shapes or levels, with the same pixels, or that look like PSFs, and if the first cannot be
-    used; SettingError for invalid options.
+    The report's `frames` says what became of each raw. FrameError for raws of different shapes or levels, with the same
+    pixels, or that look like PSFs, and if the first cannot be used; SettingError for invalid options.
     """
     _refuse_other_pictures(options, raws)
-    solved = _solved(CaptureReconstructor(options), frames_of_capture(raws, {})).made
-    if options.output is not None:
-        write_picture(options.output, solved.picture, solved.simulated)
+    capture = CaptureReconstructor(options)
+    refuse_outputs(output, raws, options)
+    solved = _solved(capture, frames_of_capture(raws, {})).made
+    if output.picture is not None:
+        write_picture(output.picture, solved.picture, solved.simulated)
     return solved
 
 
 def reconstruct_colours(
-    sources: Sequence[ChannelSource], options: ReconstructOptions, darks: Mapping[str, Source] | None = None
+    sources: Sequence[ChannelSource],
+    options: ReconstructOptions,
+    darks: Mapping[str, Source] | None = None,
+    output: OutputFiles = NO_FILES,
 ) -> FileReconstruction:
     """Reconstruct one picture (rows, cols, 3) in red, green and blue, and write it.
 
     A channel that is given more than once is a burst. The picture is on the grid of the first green frame, without
-    green of the first frame; it has the size of the raws and is 0 outside a known field. `options` holds all other
-    options (`raw` and `psfs` are ignored), `darks` the dark frames of single channels. The report is that of the
-    reference, with `channels`. SettingError for options that do not fit, FrameError as for a burst, and if no other
-    colour can be joined.
+    green of the first frame; it has the size of the raws and is 0 outside a known field. `options` has no PSFs, `darks`
+    holds the dark frames of single channels. The report is that of the reference, with `channels`. SettingError for
+    options that do not fit, FrameError as for a burst, and if no other colour can be joined.
     """
     channels = _by_name(sources)
     darks = darks or {}
     _refuse_invalid_channels(channels, options, darks)
+    given = [source for one in channels.values() for source in one]
+    psfs = [one.psf for one in given if one.psf is not None]
+    refuse_outputs(output, (*(one.raw for one in given), *psfs, *darks.values()), options)
     reference: Colour = "green" if "green" in channels else next(iter(channels))
     of_colours = {
         name: replace(options, psfs=_psfs(given[0]), dark=darks.get(name, options.dark))
@@ -83,8 +92,8 @@ def reconstruct_colours(
         raise FrameError(f"no other colour can be joined to {reference}: {reasons}", "Look at these frames.")
     picture = np.zeros((*made.picture.shape, 3), np.float32)
     picture[solved.box] = solved.colour
-    if options.output is not None:
-        write_picture(options.output, picture, made.simulated)
+    if output.picture is not None:
+        write_picture(output.picture, picture, made.simulated)
     return replace(made, picture=picture)
 
 
@@ -101,20 +110,19 @@ def _solved(capture: CaptureReconstructor, frames: CaptureFrames) -> CaptureReco
 
 
 def _refuse_other_pictures(options: ReconstructOptions, raws: Sequence[Source]) -> None:
-    """Raise SettingError for too many raws, options that only one raw has, or an output that is a raw."""
+    """Raise SettingError for too many raws, or options that only one raw has."""
     if len(raws) > MAX_FRAMES:
         raise SettingError(f"{len(raws)} raws are no burst", f"Give 2 to {MAX_FRAMES} raws of one eye in one light.")
     if options.sweep is not None or options.even:
         raise SettingError(
             "the picture of several frames is not evened out, and has no sweep", "Leave --even and --sweep out."
         )
-    refuse_overwriting((options.output, options.report), raws)  # the options name only the first raw
 
 
 def _refuse_invalid_channels(
     channels: Mapping[Colour, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
 ) -> None:
-    """Raise SettingError for options that a colour picture does not have, or an output that is an input."""
+    """Raise SettingError for options that a colour picture does not have."""
     given = [source for one in channels.values() for source in one]
     if options.calibration is not None and (darks or any(one.psf is not None for one in given)):
         raise SettingError(
@@ -138,10 +146,6 @@ def _refuse_invalid_channels(
                 f"{name_of(one.raw, 'the raw')} was taken in {light} light, and is given as {one.name}",
                 f"Give it as --channel {light}.",
             )
-    if options.output is not None:
-        refuse_output(options.output)
-    inputs = [*(one.psf for one in given), *darks.values(), options.dark, options.flat, options.head]
-    refuse_overwriting((options.output, options.report), inputs)
     _refuse_other_pictures(options, [one.raw for one in given])
 
 

@@ -139,7 +139,7 @@ class LoadedCapture:
 
 
 class CaptureReconstructor:
-    """Reconstruction of the captures of one calibration; the options but `raw` hold for all of them. Not thread-safe.
+    """Reconstruction of the captures of one calibration with the same options. Not thread-safe.
 
     `of_colours` are the options of the other colours, with PSFs and dark frame of their own, where `options` has files
     of PSFs and no archived calibration. SettingError for invalid options.

@@ -1,7 +1,6 @@
 """`diffuscope reconstruct --each`: one picture for each raw of a recording, in one process with one planned solver."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from device.clock import SystemClock
@@ -28,14 +27,14 @@ def reconstruct_each(
 ) -> int:
     """Write FOLDER/<name of the raw>.tiff for each raw, and a report to `reports`; return the number of failed raws.
 
-    `options` holds all other options (`raw` and `output` are ignored). `done` gets a line for each picture; `progress`
+    `done` gets a line for each picture; `progress`
     gets the number of raws that are done, the seconds left, each error, and each note once. The folders are created.
     SettingError or SpecError for options that are wrong for every raw, StoreFull for a full disk.
     """
     if options.sweep is not None:
         raise SettingError("a sweep is drawn for one raw", "Leave --sweep or --each out.")
     places = _places(raws, folder)
-    reconstruct = FileReconstructor(replace(options, raw=raws[0], output=None, report=None))
+    reconstruct = FileReconstructor(options)
     for one in (folder, *([] if reports is None else [reports])):
         _make_folder(one)
     clock = SystemClock()

@@ -134,20 +134,32 @@ class FileReconstruction(Reconstruction):
         return json.dumps(asdict(self.report) | {KEY: self.simulated}, indent=1) + "\n"
 
 
-def reconstruct_file(options: ReconstructOptions) -> FileReconstruction:
-    """Reconstruct the raw of the options, write picture and sweep plot; return the result before the `even` correction.
+@dataclass(frozen=True)
+class OutputFiles:
+    """Files of a reconstruction, its picture and its report; one that is None is not written."""
 
-    `report` is not written here. Invalid options raise an error before any computation.
+    picture: Path | None = None
+    report: Path | None = None
+
+
+NO_FILES = OutputFiles()
+
+
+def reconstruct_file(raw: Source, options: ReconstructOptions, output: OutputFiles = NO_FILES) -> FileReconstruction:
+    """Reconstruct a raw, write picture and sweep plot; return the result before the `even` correction.
+
+    The report is not written here. Invalid options raise an error before any computation.
     """
     reconstruct = FileReconstructor(options, None if options.budget_s else Planner(options.plans, effort=ONCE))
-    made = reconstruct(options.raw)
-    if options.output is not None:
-        write_picture(options.output, reconstruct.evened(made.picture), made.simulated)
+    refuse_outputs(output, (raw,), options)
+    made = reconstruct(raw)
+    if output.picture is not None:
+        write_picture(output.picture, reconstruct.evened(made.picture), made.simulated)
     return made
 
 
 class FileReconstructor:
-    """Reconstruction of the raw frames of one recording: the options but `raw` hold for all of them.
+    """Reconstruction of the raw frames of one recording with the same options.
 
     PSFs are read once for each shape of raw, and a solver is planned once for each shape and set of levels; KEPT_PLANS
     are kept. Not thread-safe. `planner` replaces the one that keeps its FFT plans in `options.plans`. SettingError for
@@ -453,6 +465,11 @@ def refuse_invalid(options: ReconstructOptions) -> None:
     """Raise SettingError for options that are out of range or contradict each other, before any computation."""
     if (options.calibration is None) == (not options.psfs):
         raise SettingError("a picture needs either PSFs or a calibration", "Give --psf FILE or --calibration DIR[:ID].")
+    refuse_invalid_settings(options)
+
+
+def refuse_invalid_settings(options: ReconstructOptions) -> None:
+    """Raise SettingError for a method, its settings, a time budget, a bin or rounds out of range."""
     if options.method is not None:
         method = find_method(options.method)  # raises SettingError for an unknown or a wrong one
         check_settings(method.name, method.settings, options.settings)
@@ -462,15 +479,17 @@ def refuse_invalid(options: ReconstructOptions) -> None:
         raise SettingError(f"a bin of {options.bin} holds no pixel", "Give --bin from 1: it is pixels per sample.")
     if options.rounds is not None and not 1 <= options.rounds <= MAX_ROUNDS:
         raise SettingError(f"{options.rounds} rounds cannot be run", f"Give --rounds from 1 to {MAX_ROUNDS}.")
-    _refuse_outputs(options)
 
 
-def _refuse_outputs(options: ReconstructOptions) -> None:
-    """Raise SettingError for an output that cannot be written, is of no known kind, or would replace an input."""
-    if options.output is not None:
-        refuse_output(options.output)
-    inputs = (options.raw, *options.psfs, options.dark, options.flat, options.head)
-    refuse_overwriting((options.output, options.report, options.sweep), inputs)
+def refuse_outputs(output: OutputFiles, inputs: Iterable[Source], options: ReconstructOptions) -> None:
+    """Raise SettingError for an output that cannot be written, is of no known kind, or would replace an input.
+
+    `inputs`: raws, and other inputs that the options do not name.
+    """
+    if output.picture is not None:
+        refuse_output(output.picture)
+    read = (*inputs, *options.psfs, options.dark, options.flat, options.head)
+    refuse_overwriting((output.picture, output.report, options.sweep), read)
 
 
 def refuse_overwriting(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:

@@ -46,29 +46,26 @@ MAX_EQUAL = 0.9  # share of a raw's pixels that may have its maximum: with more,
 SWAPPED = 1.1  # ratio of `concentration`, raw over PSF: recordings have 0.56 to 0.85, swapped 1.18 to 1.80
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructOptions:
-    """Options of `diffuscope reconstruct`; `plans` is the folder of cached FFT plans (None: not cached).
+    """Options of a reconstruction of any raws; `plans` is the folder of cached FFT plans (None: not cached).
 
-    Images are paths or arrays, `head` a file or what it holds. `output` None writes nothing. `even`: flat-field
-    correction of the picture. `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and
+    Images are paths or arrays, `head` a file or what it holds. `even`: flat-field correction of the picture. `sweep`:
+    file of the sweep plot. `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and
     `settings` (of the method, see device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`:
     the raw is a mosaic of this pattern, or "none". `field_fixed`: the field is known exactly, and the refraction does
     not estimate its edge. `refraction` False leaves the refraction out.
     """
 
-    raw: Source
-    psfs: tuple[Source, ...]
-    output: Path | None
-    method: str | None
-    budget_s: float | None
-    dark: Source | None
-    flat: Source | None
-    head: Path | InstrumentSpec | None
-    field_deg: float | None
-    even: bool
-    plans: Path | None
-    report: Path | None = None
+    psfs: tuple[Source, ...] = ()
+    method: str | None = None
+    budget_s: float | None = None
+    dark: Source | None = None
+    flat: Source | None = None
+    head: Path | InstrumentSpec | None = None
+    field_deg: float | None = None
+    even: bool = False
+    plans: Path | None = None
     sweep: Path | None = None
     calibration: str | None = None
     bin: int | None = None

@@ -220,14 +220,12 @@ def check_model_eye(head: Path, frame: ModelEyeFrame) -> ModelEyeResult:
     spec = load_head(head)
     promise = promise_of(spec, frame.exposure_s)
     mean_e, peak_e = _electrons(spec, frame, promise)
-    options = ReconstructOptions(
-        frame.raw, (frame.psf,), None, None, None, frame.dark, None, head, None, False, resources.fft_plans()
-    )
-    made = reconstruct_file(options)
+    options = ReconstructOptions(psfs=(frame.psf,), dark=frame.dark, head=head, plans=resources.fft_plans())
+    made = reconstruct_file(frame.raw, options)
     if found := [warning for warning in made.report.warnings if warning in MISMATCHES.values()]:
         raise PsfError(found[0], "Calibrate the head, or give the PSF that was measured with this head and this mode.")
     wide_deg = min(max(WIDER * promise.field_deg, promise.dark_deg), 120.0)
-    wide = reconstruct_file(replace(options, field_deg=wide_deg)).picture
+    wide = reconstruct_file(frame.raw, replace(options, field_deg=wide_deg)).picture
     fit = fit_chart(wide, promise.px_per_deg, promise.field_deg)
     if fit.agreement < MIN_AGREEMENT:
         raise FrameError(

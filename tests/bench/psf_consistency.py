@@ -95,10 +95,7 @@ def write_case(folder: Path, name: str, counts: Counts, psf: Image, head: Path |
 
 def report_of(case: Case, folder: Path, psfs: tuple[Path, ...]) -> Report:
     """Return the report of `diffuscope reconstruct`."""
-    order = ReconstructOptions(
-        case.raw, psfs, folder / "out.npy", None, None, None, None, case.head, None, False, PLANS
-    )
-    return reconstruct_file(order).report
+    return reconstruct_file(case.raw, ReconstructOptions(psfs=psfs, head=case.head, plans=PLANS)).report
 
 
 def wrong(case: Case, folder: Path, foreign: dict[str, Image]) -> Iterator[tuple[str, tuple[Path, ...]]]:

@@ -68,12 +68,12 @@ class SolverCache:
         self._planner = Planner(folder=None, effort="FFTW_ESTIMATE")
         self._kept: OrderedDict[tuple[object, ...], Reconstructor] = OrderedDict()
 
-    def __call__(self, order: ReconstructOptions, files: tuple[object, ...]) -> Reconstruction:
-        """Return the result of `diffuscope reconstruct` with the options `order`.
+    def __call__(self, file: Path, order: ReconstructOptions, files: tuple[object, ...]) -> Reconstruction:
+        """Return the result of `diffuscope reconstruct` on a raw with the options `order`.
 
         `files` identifies the content of all files but the raw.
         """
-        loaded = load_raw(order.raw, checked=False)
+        loaded = load_raw(file, checked=False)
         raw = loaded.raw
         known = raw.stored_bits, raw.white_dn, raw.bad.tobytes() if raw.bad.any() else b""
         key = (*files, order.method, order.budget_s, *known)
@@ -112,9 +112,9 @@ class CaseRunner:
         return [self._cell(case, frame, column) for column in self.columns]
 
     def _cell(self, case: Case, frame: HardFrame, column: str) -> Cell:
-        order, files = self.files(frame, column)
+        raw, order, files = self.files(frame, column)
         try:
-            made = self._solvers(order, files)
+            made = self._solvers(raw, order, files)
         except (DiffuscopeError, *CRASHES) as error:
             ours = isinstance(error, DiffuscopeError)
             words = error.message if isinstance(error, DiffuscopeError) else f"{type(error).__name__}: {error}"
@@ -147,8 +147,8 @@ class CaseRunner:
             return self._inside
         return self._inside & (frame.simulated.sampled(frame.seen.astype(np.float32)) > 0.99)
 
-    def files(self, frame: HardFrame, column: str) -> tuple[ReconstructOptions, tuple[object, ...]]:
-        """Write the input files; return the options for `column`, and the cache key of all files but the raw.
+    def files(self, frame: HardFrame, column: str) -> tuple[Path, ReconstructOptions, tuple[object, ...]]:
+        """Write the input files; return the raw, the options for `column`, and the cache key of all files but the raw.
 
         The files are raw, PSF, head file and flat frame. The key holds the hashes of the PSF and of the flat frame's
         NaN mask, and the text of the head file.
@@ -162,20 +162,15 @@ class CaseRunner:
             flat = self.folder / "flat.npy"
             np.save(flat, frame.flat)
         order = ReconstructOptions(
-            raw=raw,
             psfs=(psf,),
-            output=self.folder / "picture.npy",
             method=None if column == DEFAULT_SCHEDULE else column,
             budget_s=LONG_DEADLINE_S if column == DEFAULT_SCHEDULE else None,
-            dark=None,
             flat=flat,
             head=head,
-            field_deg=None,
-            even=False,
             plans=self.folder,
         )
         content = (frame.psf.tobytes(), b"" if frame.flat is None else np.isnan(frame.flat).tobytes())
-        return order, (*map(hash, content), head_toml(frame.head))
+        return raw, order, (*map(hash, content), head_toml(frame.head))
 
 
 def correlation(picture: Image, truth: Image, inside: Mask) -> float:

@@ -5,11 +5,12 @@ The whole grid is `make test-hard`.
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from services.research.reconstruct_file import reconstruct_file
+from services.research.reconstruct_file import OutputFiles, reconstruct_file
 from tests.hard.cases import CASES, CLEAN, NAMED
 from tests.hard.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
 from tests.hard.frames import Eye
@@ -55,11 +56,11 @@ def test_a_hard_case_keeps_its_bound_or_is_reported(
     assert not [f"{one.rule}: {one.words}" for one in violations(cells) if one.rule != "coverage"]
 
 
-def test_the_grid_and_the_command_give_the_same_picture(grid: CaseRunner, clean: list[Cell]) -> None:
+def test_the_grid_and_the_command_give_the_same_picture(grid: CaseRunner, clean: list[Cell], tmp_path: Path) -> None:
     """The grid keeps planned solvers, the command plans each time: both give the same picture and warnings."""
-    order, _ = grid.files(EYE.clean, DEFAULT_SCHEDULE)
-    made = reconstruct_file(order)
-    assert clean[0].pcc == pytest.approx(_pcc(np.load(order.output)), abs=1e-4)
+    raw, order, _ = grid.files(EYE.clean, DEFAULT_SCHEDULE)
+    made = reconstruct_file(raw, order, OutputFiles(tmp_path / "picture.npy"))
+    assert clean[0].pcc == pytest.approx(_pcc(np.load(tmp_path / "picture.npy")), abs=1e-4)
     assert made.report.warnings == clean[0].warnings
     assert clean[0].pcc > 0.95
 

@@ -83,19 +83,8 @@ def test_the_command_warns_of_a_rotated_and_a_mirrored_psf(tmp_path: Path) -> No
     warnings = {}
     for name, psf in {"right": right, "rotated": right[::-1, ::-1], "mirrored": right[:, ::-1]}.items():
         np.save(tmp_path / f"{name}.npy", psf)
-        order = ReconstructOptions(
-            tmp_path / "raw.npy",
-            (tmp_path / f"{name}.npy",),
-            tmp_path / "out.npy",
-            "gradient",
-            None,
-            None,
-            None,
-            None,
-            None,
-            False,
-            tmp_path,
-        )
-        warnings[name] = tuple(words for words in reconstruct_file(order).report.warnings if "PSF" in words)
+        order = ReconstructOptions(psfs=(tmp_path / f"{name}.npy",), method="gradient", plans=tmp_path)
+        made = reconstruct_file(tmp_path / "raw.npy", order)
+        warnings[name] = tuple(words for words in made.report.warnings if "PSF" in words)
     mirrored = (MISMATCHES[Match.MIRRORED_LEFT_RIGHT],)
     assert warnings == {"right": (), "rotated": (MISMATCHES[Match.ROTATED],), "mirrored": mirrored}

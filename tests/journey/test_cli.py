@@ -13,7 +13,7 @@ from device.config.image_files import read_image
 from device.errors import InputError
 from services.cli import main
 from services.http.server import bind_socket
-from services.research.reconstruct_file import reconstruct_file
+from services.research.reconstruct_file import FileReconstruction, OutputFiles, reconstruct_file
 from services.research.reconstruct_inputs import ReconstructOptions
 from tests.journey.conftest import Diffuscope
 from tests.progress_lines import without_progress
@@ -122,26 +122,15 @@ def test_reconstruct_writes_picture_and_report(
     assert all(seconds >= 0 for seconds in facts["seconds"].values())
 
 
-def make_options(scene: Path, plans: Path, output: Path, **changes: Any) -> ReconstructOptions:
-    asked: dict[str, Any] = {
-        "raw": scene / "raw.tiff",
-        "psfs": (scene / "psf.tiff",),
-        "output": output,
-        "method": "gradient",
-        "budget_s": None,
-        "dark": None,
-        "flat": None,
-        "head": None,
-        "field_deg": None,
-        "even": False,
-        "plans": plans,
-    }
-    return ReconstructOptions(**asked | changes)
+def made_from(scene: Path, plans: Path, output: Path, raw: Path | None = None, **changes: Any) -> FileReconstruction:
+    """Return the picture of a raw, by default that of the scene, which is written to `output`."""
+    options = ReconstructOptions(psfs=(scene / "psf.tiff",), plans=plans, **{"method": "gradient"} | changes)
+    return reconstruct_file(raw or scene / "raw.tiff", options, OutputFiles(output))
 
 
 def test_tiff_npy_and_png_hold_the_same_picture(scene: Path, plans: Path, tmp_path: Path) -> None:
     for ending in ("npy", "tiff", "png"):
-        reconstruct_file(make_options(scene, plans, tmp_path / f"x.{ending}"))
+        made_from(scene, plans, tmp_path / f"x.{ending}")
     exact, tiff = read_image(tmp_path / "x.npy"), read_image(tmp_path / "x.tiff")
     assert tiff.dtype == np.float32
     assert np.allclose(tiff, exact, rtol=1e-5, atol=1e-5 * np.abs(exact).max())
@@ -157,7 +146,7 @@ def test_three_channels_are_kept(scene: Path, plans: Path, tmp_path: Path, endin
     colour = np.stack([grey, grey // 2 + 32, grey // 4 + 48], axis=2)
     np.save(tmp_path / "raw.npy", colour)
     out = tmp_path / f"x.{ending}"
-    reconstruct_file(make_options(scene, plans, out, raw=tmp_path / "raw.npy"))
+    made_from(scene, plans, out, raw=tmp_path / "raw.npy")
     picture = read_image(out)
     assert picture.shape == (270, 480, 3)
     means = picture.reshape(-1, 3).mean(axis=0)
@@ -165,7 +154,7 @@ def test_three_channels_are_kept(scene: Path, plans: Path, tmp_path: Path, endin
 
 
 def test_budget_is_kept_and_an_invalid_one_refused(scene: Path, plans: Path, tmp_path: Path, refused: Refused) -> None:
-    made = reconstruct_file(make_options(scene, plans, tmp_path / "x.npy", budget_s=1e-6))
+    made = made_from(scene, plans, tmp_path / "x.npy", budget_s=1e-6)
     assert made.report.stopped == "deadline"
     assert made.report.bin > 1
     assert read_image(tmp_path / "x.npy").shape == (270, 480)
@@ -176,7 +165,7 @@ def test_budget_is_kept_and_an_invalid_one_refused(scene: Path, plans: Path, tmp
 
 
 def test_simulated_mark_is_kept(scene: Path, head_file: Path, plans: Path, tmp_path: Path) -> None:
-    made = reconstruct_file(make_options(scene, plans, tmp_path / "x.png", head=head_file))
+    made = made_from(scene, plans, tmp_path / "x.png", head=head_file)
     assert made.simulated is True
     with Image.open(tmp_path / "x.png") as picture:
         assert picture.text["simulated"] == "true"  # type: ignore[attr-defined]

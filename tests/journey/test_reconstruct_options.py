@@ -32,20 +32,8 @@ def refusal(answer: Answer) -> str:
     return answer.err
 
 
-def options(raw: Any, psfs: Iterable[Any], **changes: Any) -> ReconstructOptions:
-    known: dict[str, Any] = {
-        "output": None,
-        "method": "gradient",
-        "budget_s": None,
-        "dark": None,
-        "flat": None,
-        "head": None,
-        "field_deg": None,
-        "even": False,
-        "plans": None,
-        "bin": 1,
-    }
-    return ReconstructOptions(raw, tuple(psfs), **known | changes)
+def options(psfs: Iterable[Any], **changes: Any) -> ReconstructOptions:
+    return ReconstructOptions(psfs=tuple(psfs), **{"method": "gradient", "bin": 1} | changes)
 
 
 def test_bin_rounds_and_settings_are_used_and_reported(folder: Path) -> None:
@@ -61,10 +49,10 @@ def test_bin_rounds_and_settings_are_used_and_reported(folder: Path) -> None:
 
 @pytest.mark.parametrize(("method", "setting"), [("tikhonov", "mu"), ("gradient", "mu"), ("evidence", "prior_slope")])
 def test_setting_replaces_the_value_of_the_frame(method: str, setting: str) -> None:
-    own = reconstruct_file(options(scene(), [caustic()], method=method))
+    own = reconstruct_file(scene(), options([caustic()], method=method))
     value = float(own.report.regularisation[setting])
     same, other = (
-        reconstruct_file(options(scene(), [caustic()], method=method, settings={setting: given}))
+        reconstruct_file(scene(), options([caustic()], method=method, settings={setting: given}))
         for given in (value, 2 * value + 1)
     )
     assert np.allclose(same.picture, own.picture, atol=1e-4 * own.picture.max())
@@ -74,10 +62,10 @@ def test_setting_replaces_the_value_of_the_frame(method: str, setting: str) -> N
 
 def test_an_overexposed_frame_gives_one_picture_whatever_its_ceiling() -> None:
     clipped = np.minimum(scene(), 1023)  # 5 % of the pixels
-    as_stored = reconstruct_file(options(clipped, [caustic()]))
+    as_stored = reconstruct_file(clipped, options([caustic()]))
     for scale, black_dn in ((1.0, 15), (1 / 1023, 0)):
         other = (clipped - np.minimum(clipped, black_dn)) * scale
-        made = reconstruct_file(options(other.astype(np.float32 if scale < 1 else np.uint16), [caustic()]))
+        made = reconstruct_file(other.astype(np.float32 if scale < 1 else np.uint16), options([caustic()]))
         assert made.report.warnings == as_stored.report.warnings
         assert any("saturated and were left out" in warning for warning in made.report.warnings)
         agreement = np.corrcoef(made.picture.ravel(), as_stored.picture.ravel())[0, 1]
@@ -137,7 +125,7 @@ def test_each_refuses_pictures_that_would_replace_a_file(folder: Path) -> None:
 
 
 def test_reconstructor_plans_once_for_frames_of_equal_levels() -> None:
-    reconstructor = FileReconstructor(options(scene(), [caustic()]))
+    reconstructor = FileReconstructor(options([caustic()]))
     first, second = reconstructor(scene()), reconstructor(scene()[::-1].copy())
     assert second.report.seconds["solve"] < 1
     assert not np.allclose(first.picture, second.picture)
@@ -147,10 +135,10 @@ def test_reconstructor_plans_once_for_frames_of_equal_levels() -> None:
 def test_colour_psf_is_used_per_channel() -> None:
     psfs = [caustic(), caustic()[::-1], caustic()[:, ::-1]]
     raws = [scene(), scene()[::-1], scene()[:, ::-1]]
-    made = reconstruct_file(options(np.dstack(raws), [np.dstack(psfs)]))
+    made = reconstruct_file(np.dstack(raws), options([np.dstack(psfs)]))
     assert made.report.psf_channels == 3
     for c in range(3):
-        single = reconstruct_file(options(raws[c], [psfs[c]]))
+        single = reconstruct_file(raws[c], options([psfs[c]]))
         assert np.allclose(made.picture[..., c], single.picture, atol=2e-2 * single.picture.max())
 
 
@@ -158,7 +146,7 @@ def test_mosaic_is_solved_in_planes() -> None:
     smooth = ndimage.gaussian_filter(np.dstack([scene() * share for share in (1.0, 0.6, 0.3)]), (2, 2, 0))
     psf = ndimage.gaussian_filter(caustic().astype(np.float32), 2)
     mosaic = np.rint(mosaic_of(smooth, "grbg")).astype(np.uint16)
-    made = reconstruct_file(options(mosaic, [psf], bayer="grbg"))
+    made = reconstruct_file(mosaic, options([psf], bayer="grbg"))
     assert made.picture.shape == (*SHAPE, 3)
     assert (made.report.bayer, made.report.solved) == ("grbg", (48, 64))
     red, green, blue = made.picture.reshape(-1, 3).mean(axis=0)
@@ -184,16 +172,16 @@ def mosaic_dng(path: Path, shift: int = 0) -> Path:
 def test_label_of_a_mosaic_is_believed_only_with_the_pixels_of_one(tmp_path: Path, shift: int) -> None:
     mosaic = mosaic_dng(tmp_path / "mosaic.dng", shift)
     mono = write_dng(tmp_path / "mono.dng", scene(), shift)
-    assert reconstruct_file(options(mosaic, [caustic()])).report.bayer == "bggr"
+    assert reconstruct_file(mosaic, options([caustic()])).report.bayer == "bggr"
     for given, label in ((None, None), ("none", None), ("bggr", "bggr")):
-        made = reconstruct_file(options(mono, [caustic()], bayer=given))
+        made = reconstruct_file(mono, options([caustic()], bayer=given))
         assert made.report.bayer == label
         noted = any("labelled as a colour mosaic (bggr)" in warning for warning in made.report.warnings)
         assert noted == (given is None)
-    made = reconstruct_file(options(mono, [caustic()])).picture
-    expected = reconstruct_file(options(scene(), [caustic()])).picture
+    made = reconstruct_file(mono, options([caustic()])).picture
+    expected = reconstruct_file(scene(), options([caustic()])).picture
     assert np.corrcoef(made.ravel(), expected.ravel())[0, 1] > 0.999
-    forced = reconstruct_file(options(mosaic, [caustic()], bayer="none"))
+    forced = reconstruct_file(mosaic, options([caustic()], bayer="none"))
     assert forced.picture.ndim == 2
     assert not any("mosaic" in warning for warning in forced.report.warnings)
 
@@ -202,8 +190,8 @@ def test_black_level_of_a_dng_is_no_light_of_its_flat_frame(tmp_path: Path) -> N
     falloff = np.linspace(400, 2400, SHAPE[1])[None] + np.zeros(SHAPE)
     raw = write_dng(tmp_path / "raw.dng", np.rint(scene() * falloff / 2400).astype(np.uint16))
     flat = write_dng(tmp_path / "flat.dng", np.rint(falloff).astype(np.uint16))
-    made = reconstruct_file(options(raw, [caustic()], flat=flat, bayer="none")).picture
-    expected = reconstruct_file(options(scene(), [caustic()])).picture
+    made = reconstruct_file(raw, options([caustic()], flat=flat, bayer="none")).picture
+    expected = reconstruct_file(scene(), options([caustic()])).picture
     assert np.corrcoef(made.ravel(), expected.ravel())[0, 1] > 0.999
 
 

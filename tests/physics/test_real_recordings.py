@@ -159,8 +159,8 @@ def test_the_command_warns_of_a_rotated_psf_and_of_a_target_in_several_depths_on
 
 def psf_warnings(folder: Path, raw: Path, *psfs: Path) -> tuple[str, ...]:
     """Return the warnings of `diffuscope reconstruct`, without those about brightness."""
-    order = ReconstructOptions(raw, psfs, folder / "out.npy", None, None, None, None, None, None, False, folder)
-    return tuple(words for words in reconstruct_file(order).report.warnings if "too bright" not in words)
+    made = reconstruct_file(raw, ReconstructOptions(psfs=psfs, plans=folder))
+    return tuple(words for words in made.report.warnings if "too bright" not in words)
 
 
 def test_the_folders_of_the_recordings_are_recognised() -> None:

@@ -68,7 +68,5 @@ def test_files_of_psfs_are_read_without_hot_pixels(way: str, tmp_path: Path) -> 
     if way == "import-psf":
         psf: Psf = read_imported_psf((tmp_path / "psf.npy",), ImportedPsfInfo()).calibration.psfs[0]
     else:
-        given: dict[str, Any] = dict.fromkeys(("output", "method", "budget_s", "dark", "flat", "head", "field_deg"))
-        options = ReconstructOptions(scene(), (tmp_path / "psf.npy",), **given, even=False, plans=None)
-        psf = load_psfs(options, load_raw(scene())).stacks[0][0]
+        psf = load_psfs(ReconstructOptions(psfs=(tmp_path / "psf.npy",)), load_raw(scene())).stacks[0][0]
     assert psf.pixels[hot].max() < 0.1 * psf.pixels.max()
