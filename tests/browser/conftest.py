@@ -135,8 +135,9 @@ class Complaints:
         page.on("requestfailed", failed)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    """A browser of the tests of one file: while Playwright runs, no other test of its process can use asyncio.run."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield browser
