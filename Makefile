@@ -4,7 +4,7 @@ SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 PORT ?= 8000
-# As in systemd/diffuscope.service: the products are small, and waiting threads of BLAS take the cores of other processes.
+# As services/cli.py sets it for every command: the products are small, and waiting threads of BLAS take the cores of other processes.
 export OPENBLAS_NUM_THREADS := 1
 # Hundreds of processes of the tests import the same modules: their bytecode is kept even where the environment forbids it.
 unexport PYTHONDONTWRITEBYTECODE
