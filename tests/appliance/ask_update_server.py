@@ -1,4 +1,4 @@
-"""Program of the wrong-clock test: verify a channel file, then read it from an HTTPS server; run under `faketime`."""
+"""Program of the wrong-clock test: verify a channel file, then read it from an HTTPS server; run at another date."""
 
 import sys
 from pathlib import Path
