@@ -226,7 +226,7 @@ def table(found: Frontier) -> str:
         lines.append(f"  {peer.name}: {peer.psnr_db:.2f} dB in {peer.seconds:.3f} s")
     for one in found.light:
         lines.append(
-            f"  {one.frames} frames ({one.used} used), {one.dose_j_per_cm2:.2g} J/cm2: {one.psnr_db:.2f} dB in "
+            f"  {one.length} ({one.used} used), {one.dose_j_per_cm2:.2g} J/cm2: {one.psnr_db:.2f} dB in "
             f"{one.seconds_median:.3f} s; linear bound {one.bound_psnr_db:.2f} dB"
         )
     return "\n".join([*lines, *(f"left out: {one}" for one in found.left_out)])

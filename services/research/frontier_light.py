@@ -94,7 +94,7 @@ def measure_light(
             scores.vessel_contrast,
             judge(bound).psnr_db,
         )
-        progress(f"{n} frames: {point.psnr_db:.2f} dB, linear bound {point.bound_psnr_db:.2f} dB")
+        progress(f"{point.length}: {point.psnr_db:.2f} dB, linear bound {point.bound_psnr_db:.2f} dB")
         found.append(point)
     return tuple(found)
 

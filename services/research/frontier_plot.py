@@ -6,7 +6,7 @@ from math import log10
 
 from device.recon.methods import METHODS, Method
 from services.plot import Mark, Panel, Plot, Series, log_axis, stacked_svg, time_axis, value_axis
-from services.research.frontier_result import Frontier, LightPoint, Point, pareto_front
+from services.research.frontier_result import Frontier, Point, pareto_front
 from services.research.frontier_thumbnails import LETTERS, nearest_points
 
 PEER_KIND, BURST_KIND, BOUND_KIND = 5, 6, 7  # of marks, the same in both plots
@@ -123,7 +123,7 @@ def _light_plot(found: Frontier) -> Plot:
     bounds = []
     for one in found.light:
         dose_uj_per_cm2 = one.dose_j_per_cm2 * 1e6
-        words = _frames(one)
+        words = one.length
         spent = f"{words}, {dose_uj_per_cm2:.3g} uJ/cm2: {one.seconds_median * 1e3:.0f} ms"
         label = f"{words} in {one.seconds_median:.2g} s"
         bursts.append(Mark(dose_uj_per_cm2, one.psnr_db, label, f"{spent}, {one.psnr_db:.2f} dB"))
@@ -145,10 +145,6 @@ def _light_plot(found: Frontier) -> Plot:
     )
 
 
-def _frames(one: LightPoint) -> str:
-    return f"{one.frames} frame{'s' if one.frames > 1 else ''}"
-
-
 def _number(value: float) -> str:
     return f"{value:g}"
 
@@ -167,7 +163,7 @@ def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
     choice = found.choice
     best = ", ".join(f"{value:.1f} dB in {seconds * 1e3:.0f} ms" for seconds, value in edge)
     bursts = ", ".join(
-        f"{one.frames} frames {one.psnr_db:.1f} dB (linear bound {one.bound_psnr_db:.1f}) for "
+        f"{one.length} {one.psnr_db:.1f} dB (linear bound {one.bound_psnr_db:.1f}) for "
         f"{one.dose_j_per_cm2 * 1e6:.3g} uJ/cm2"
         for one in found.light
     )
@@ -221,8 +217,8 @@ def _bursts_in_time(found: Frontier) -> tuple[Series, ...]:
         Mark(
             one.seconds_median,
             one.psnr_db,
-            _frames(one),
-            f"{_frames(one)}: {one.seconds_median * 1e3:.0f} ms, {one.psnr_db:.2f} dB",
+            one.length,
+            f"{one.length}: {one.seconds_median * 1e3:.0f} ms, {one.psnr_db:.2f} dB",
         )
         for one in found.light
     )

@@ -88,6 +88,11 @@ class LightPoint:
     vessel_contrast: float | None
     bound_psnr_db: float
 
+    @property
+    def length(self) -> str:
+        """Number of frames in words: `1 frame`, `2 frames`."""
+        return f"{self.frames} frame{'s' if self.frames > 1 else ''}"
+
 
 @dataclass(frozen=True)
 class PeerPoint:
