@@ -79,13 +79,20 @@ Peers = Annotated[Path, typer.Option(help="Python environment with LenslessPiCam
 NoPeers = Annotated[bool, typer.Option("--no-peers", help="Leave other solvers out.")]
 
 
+def _head_file(head: Path | None) -> Path | None:
+    return None if head is None else head_file(head)
+
+
 def _default_data() -> Path:
     return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "diffuscope"
 
 
 @app.command()
 def run(
-    head: Annotated[Path | None, typer.Option(help="Head file; the simulated head if nothing is given.")] = None,
+    head: Annotated[
+        Path | None,
+        typer.Option(callback=_head_file, help="Head file; the simulated head if nothing is given."),
+    ] = None,
     replay: Annotated[Path | None, typer.Option(help="Folder with a recording, played instead of a head.")] = None,
     raw: Annotated[list[Path] | None, typer.Option(help="Raw frames of a recording, with --psf.")] = None,
     psf: Annotated[list[Path] | None, typer.Option(help="PSF of a recording; several, or a folder: a stack.")] = None,
@@ -177,9 +184,7 @@ def reconstruct(
         typer.Option(metavar="[NAME=]FILE", help="Dark frame of the same exposure; with NAME that of one channel."),
     ] = None,
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
-    head: Annotated[
-        Path | None, typer.Option(help="Head file, or the name of a shipped one or of a scene, for the geometry.")
-    ] = None,
+    head: Annotated[Path | None, typer.Option(callback=_head_file, help="Head file or name, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
     field_fixed: Annotated[
         bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
@@ -215,7 +220,7 @@ def reconstruct(
         budget_s=budget_s,
         dark=common_dark,
         flat=flat,
-        head=head and head_file(head),
+        head=head,
         field_deg=field_deg,
         even=even,
         plans=resources.fft_plans(),
@@ -268,7 +273,8 @@ def montage(
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
     report: Annotated[Path | None, typer.Option(help="Where to write the place of each picture as JSON.")] = None,
     head: Annotated[
-        Path | None, typer.Option(help="Head file of the pictures: joined on the sphere with its scale.")
+        Path | None,
+        typer.Option(callback=_head_file, help="Head file of the pictures: joined on the sphere with its scale."),
     ] = None,
 ) -> None:
     """Join pictures of one eye to one larger picture around the first; others are left out with a reason.
@@ -277,7 +283,7 @@ def montage(
     """
     from services.research.montage_files import montage_files, placed_lines
 
-    joined = montage_files(picture, output, report, say, head and head_file(head))
+    joined = montage_files(picture, output, report, say, head)
     rows, cols = joined.picture.shape[:2]
     used = sum(one.used for one in joined.placed)
     typer.echo(f"{output}: {used} of {len(picture)} pictures on the {joined.projection}, {rows} x {cols} pixels")
@@ -302,7 +308,9 @@ def health(
 
 @app.command("probe")
 @announced("probing the head")
-def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")]) -> None:
+def probe_head(
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296.")],
+) -> None:
     """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips.
 
     The lamp shines, and its light is not counted for an eye: point the head at white paper. The exit status is 1 if a
@@ -322,7 +330,10 @@ def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardw
 @app.command("doctor")
 @announced("examining the computer")
 def examine_computer(
-    head: Annotated[Path | None, typer.Option(help="Head file; its parts are opened, without light.")] = None,
+    head: Annotated[
+        Path | None,
+        typer.Option(callback=_head_file, help="Head file; its parts are opened, without light."),
+    ] = None,
     leds: Annotated[bool, typer.Option("--leds", help="Also light each LED: point the head at white paper.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
@@ -341,7 +352,7 @@ def examine_computer(
 @app.command("frame")
 @announced("exposing")
 def take_frame(
-    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/bench.toml.")],
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, such as hardware/heads/bench.toml.")],
     output: Annotated[Path, typer.Option("-o", help="Raw frame to write, .tiff.")],
     count: Annotated[int, typer.Option(min=1, max=256, help="Exposures, of which the mean is written.")] = 1,
     exposure_s: Annotated[float | None, typer.Option(min=1e-5, max=10, help="Exposure; else the head file's.")] = None,
@@ -355,7 +366,10 @@ def take_frame(
 
 @app.command("meter")
 def light_for_meter(
-    head: Annotated[Path, typer.Option(help="Head file whose ring is measured; no camera is opened.")],
+    head: Annotated[
+        Path,
+        typer.Option(callback=_head_file, help="Head file whose ring is measured; no camera is opened."),
+    ],
     colour: Annotated[str, typer.Option(help="Of the light; by default the picture's.")] = "",
     seconds: Annotated[float, typer.Option(min=0.1, max=120, help="Of pulses and pauses together.")] = 20,
     level: Annotated[
@@ -388,7 +402,7 @@ def light_for_meter(
 @app.command("light")
 @announced("judging the light")
 def judge_light(
-    head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file whose ring was measured.")],
     axis_uw: Annotated[float, typer.Option(min=0, help="Power behind the hole on the axis, as diffuscope meter asks.")],
     waist_mw_per_cm2: Annotated[float, typer.Option(min=0, help="Mean over the brightest disc of 1 mm in the waist.")],
     peak_nm: Annotated[float, typer.Option(min=400, max=700, help="Peak wavelength.")],
@@ -419,7 +433,7 @@ def judge_light(
 
 @app.command("calibrate")
 def calibrate_head(
-    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296.")],
     archive: Annotated[Path, typer.Option(help="Where calibrations are kept.")],
     serial: Annotated[str | None, typer.Option(help="Of the head; what its memory says if nothing is given.")] = None,
     by: Annotated[str, typer.Option(help="Who calibrates.")] = "technician",
@@ -463,7 +477,7 @@ def _ask_operator(prompt: str) -> None:
 
 @app.command("trial-lenses")
 def show_trial_lenses(
-    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296.")],
     archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
     vertex_mm: Annotated[float, typer.Option(min=0, max=30, help="From the lens to the trainer eye's pupil.")] = 12.0,
     eye_dpt: Annotated[float, typer.Option(min=-10, max=10, help="Correction that the trainer eye alone needs.")] = 0.0,
@@ -486,7 +500,7 @@ def show_trial_lenses(
 
 @app.command("white-card")
 def show_white_card(
-    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296.")],
     archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
 ) -> None:
     """Show a white card to the head's own light: colour pictures then have the colours of the retina.
@@ -514,7 +528,7 @@ def _colours(words: str) -> tuple[Colour, ...]:
 @app.command("check")
 @announced("checking the head")
 def check_head(
-    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296.")],
     archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
     model_eye: Annotated[
@@ -600,7 +614,8 @@ def simulate(
 ) -> None:
     """Write what the camera would give for a scene: raw.tiff (raw-2.tiff, ...), truth.npy, psf.tiff, plan.json.
 
-    Only the effects that the scene calls for are simulated; the plan says for each which number decided.
+    Of a scene with vessels also vessels.png, their mask. Only the effects that the scene calls for are simulated; the
+    plan says for each which number decided.
     """
     from services.research import simulate_scene  # imports the simulator only for this command
 
@@ -615,7 +630,8 @@ def simulate(
         plan = simulate_scene.write_scene(spec, output, selected, frames)
     typer.echo(plan)
     more = "" if frames == 1 else f", ..., raw-{frames}.tiff"
-    typer.echo(f"{output}: raw.tiff{more}, truth.npy, psf.tiff, plan.json")
+    vessels = ", vessels.png" if (output / "vessels.png").is_file() else ""
+    typer.echo(f"{output}: raw.tiff{more}, truth.npy, psf.tiff{vessels}, plan.json")
 
 
 @app.command()
@@ -626,7 +642,9 @@ def frontier(
     raw: Annotated[Path | None, typer.Option(help="Raw frame, with --psf and --truth.")] = None,
     psf: Annotated[Path | None, typer.Option(help="Measured PSF of the raw frame.")] = None,
     truth: Annotated[Path | None, typer.Option(help="What the picture should be, on the raw's own pixels.")] = None,
-    head: Annotated[Path | None, typer.Option(help="Head file, for the geometry of a raw frame.")] = None,
+    head: Annotated[
+        Path | None, typer.Option(callback=_head_file, help="Head file, for the geometry of a raw frame.")
+    ] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc of a raw frame, in degrees.")] = None,
     budget_s: Annotated[float, typer.Option(help="The time within which the instrument chooses.")] = 0.26,
     repeats: Annotated[int, typer.Option(min=1, help="Timed turns of every point; the median counts.")] = 7,
@@ -645,7 +663,7 @@ def frontier(
         raw,
         psf,
         truth,
-        head and head_file(head),
+        head,
         field_deg,
         json_file,
         plot,
@@ -749,7 +767,10 @@ def hard(context: typer.Context) -> None:
 @app.command()
 @announced("computing")
 def optics(
-    head: Annotated[Path | None, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")] = None,
+    head: Annotated[
+        Path | None,
+        typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296."),
+    ] = None,
     sensor: Annotated[str | None, typer.Option(help="A file of device/config/sensor_presets/, such as imx296.")] = None,
     eye_mm: Annotated[float | None, typer.Option(min=5, max=35, help="Focal length of the eye.")] = None,
     pupil_mm: Annotated[float | None, typer.Option(min=0.1, max=10, help="Diameter of its pupil.")] = None,

@@ -94,7 +94,7 @@ def placed_lines(joined: Montage, pictures: Sequence[Path]) -> list[str]:
         else:
             down, right = one.shift_px
             lines.append(
-                f"{path}: shift {down:+.1f}, {right:+.1f} px, rotation {one.rotation_deg:+.2f} deg, "
+                f"{path}: {down:+.1f} px down, {right:+.1f} px right, rotation {one.rotation_deg:+.2f} deg, "
                 f"correlation {one.peak:.2f}, overlap {one.overlap:.0%}"
             )
     return lines
