@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,46 @@ Mask = NDArray[np.bool_]
 Colour = Literal["red", "green", "blue", "amber"]
 Eye = Literal["OD", "OS"]
 EYES: tuple[Eye, ...] = ("OD", "OS")
+
+
+@dataclass(frozen=True)
+class _JsonType:
+    """Marker of a number or truth value of a record, for pydantic: read from JSON as it is, never converted.
+
+    A whole number stays whole, a text or a truth value is no number; numpy scalars become plain numbers.
+    """
+
+    name: Literal["number", "integer", "boolean"]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        kinds = {float: int | float}
+        inner = handler.generate_schema(kinds.get(source, source))
+        for one in inner.get("choices", [inner]):
+            one["strict"] = True
+        return {"type": "function-before", "function": {"type": "no-info", "function": _plain_scalar}, "schema": inner}
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> Any:
+        return {"type": self.name}
+
+
+def _plain_scalar(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+Number = Annotated[float, _JsonType("number")]
+Whole = Annotated[int, _JsonType("integer")]
+Flag = Annotated[bool, _JsonType("boolean")]
+
+
+def _is_empty(value: object) -> bool:
+    return value is None or value == ()
+
+
+OMITTED_IF_EMPTY = {"exclude_if": _is_empty}  # metadata of an entry that the record of a capture has only with a value
+
+
+# Configuration of a record for pydantic: the text below a field describes its key, and every key is written.
+DESCRIBED = {"use_attribute_docstrings": True, "json_schema_serialization_defaults_required": True}
 
 
 class SimulatedCounts(np.ndarray[tuple[int, ...], np.dtype[np.uint16]]):
@@ -256,18 +296,25 @@ class Calibration:
 
 @dataclass(frozen=True)
 class FrameUse:
-    """What became of one frame of a burst.
+    """What became of one frame of a burst."""
 
-    What is at (r, c) of the reference, the first used frame, stands at (r, c) + `shift_px` (rows, cols) in this frame,
-    in pixels of the sensor; None if the frame was not registered. `weight` is its share of the joined frame, 0 to 1.
-    `reason` says why it was not used.
-    """
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = DESCRIBED
 
-    index: int
-    used: bool
-    shift_px: tuple[float, float] | None
-    weight: float
+    index: Whole
+    """Place of the frame in the burst, from 0: file raw.tiff is the frame 0, raw-1.tiff the frame 1."""
+
+    used: Flag
+    """True if the picture has the light of this frame."""
+
+    shift_px: tuple[Number, Number] | None
+    """Rows and columns: what is at (r, c) of the reference, the first used frame of the channel, stands at (r, c) plus
+    this in the frame, in pixels of the sensor. Null if the frame was not registered."""
+
+    weight: Number
+    """Share of the frame in the joined frame, 0 to 1."""
+
     reason: str | None = None
+    """Reason why the frame is not used; null if it is."""
 
 
 ONLY_FRAME = FrameUse(0, True, (0.0, 0.0), 1.0)  # a picture of one frame
@@ -275,21 +322,51 @@ ONLY_FRAME = FrameUse(0, True, (0.0, 0.0), 1.0)  # a picture of one frame
 
 @dataclass(frozen=True)
 class ChannelUse:
-    """What became of one colour: shift from the reference channel in pixels (rows, cols), and whether it is predicted.
+    """What became of one colour of light; its raw frame in red is the file raw-red.tiff."""
 
-    What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one. `reason`
-    says why a colour is missing in the picture, and `code` names that reason for programs (an error code, or a CODE of
-    the module that leaves it out); None for one that the picture has. `white_ratio` is the light of its
-    frame over that of a white card in the same lamp light; None without a white reference: the hue is then
-    neutral, that of an average retina.
-    """
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = DESCRIBED
 
     name: Colour
-    shift_px: tuple[float, float] | None
-    predicted: bool = False
+    """Colour of the light."""
+
+    shift_px: tuple[Number, Number] | None
+    """Rows and columns: what is at (r, c) of the reference, green or else the first, stands at (r, c) plus this in this
+    channel, in pixels of the raw. Null for a predicted or a missing channel."""
+
+    predicted: Flag = False
+    """True if the channel was computed from the others, not measured."""
+
     reason: str | None = None
-    white_ratio: float | None = None
+    """Why the picture has not this colour; null for one that it has."""
+
+    white_ratio: Number | None = field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Light of its frame over that of a white card in the same lamp light. Null without a white reference in the
+    calibration: the hue is then neutral, that of an average retina."""
+
+    code: str | None = field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Name of this reason for programs: the code of an error, colour.psf (no PSF of this colour) or colour.interrupted;
+    null for a colour that the picture has."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Verdict for the operator on a frame or a picture."""
+
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = DESCRIBED
+
+    word: str | None = None
+    """"good" or "again"."""
+
     code: str | None = None
+    """Cause of the verdict, for example shot.moved; null if good."""
+
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    """Known figures, to four significant digits."""
+
+    @property
+    def is_good(self) -> bool:
+        """Return whether the picture is good."""
+        return self.word == "good"
 
 
 @dataclass(frozen=True)
@@ -301,47 +378,47 @@ class Report:
     here.
     """
 
-    __pydantic_config__: ClassVar[Mapping[str, bool]] = {"use_attribute_docstrings": True}
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = DESCRIBED
 
     method: str
     """Method of the picture, as listed by `diffuscope methods`; "none" if no picture was made."""
 
-    bin: int = 1
+    bin: Whole = 1
     """Side in sensor pixels of the square that was averaged to one sample before solving."""
 
-    rounds: int = 1
+    rounds: Whole = 1
     """Rounds of the iterative solver that the picture has; 1 for a closed form, 0 without a picture."""
 
     stopped: str = "done"
     """Reason of the end: "done", "deadline" (the next round did not fit into the time budget), or an error code."""
 
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, Number] = field(default_factory=dict)
     """Durations of the stages in s."""
 
-    psf_index: int = 0
+    psf_index: Whole = 0
     """Index of the PSF that was used, in the order in which several PSFs were given; 0 for the first."""
 
-    psf_scale: float = 1.0
+    psf_scale: Number = 1.0
     """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
 
-    psf_cylinder: dict[str, float | None] | None = None
+    psf_cylinder: dict[str, Number | None] | None = field(default=None, metadata=OMITTED_IF_EMPTY)
     """Cylinder by which the PSF was warped beside its scale, and the predicted gain of the picture; null without
     one."""
 
-    refraction_dpt: dict[str, float | str | None] | None = None
+    refraction_dpt: dict[str, Number | str | None] | None = None
     """Refraction of the eye as correction at its pupil in dpt, negative for myopia; null without a known geometry."""
 
-    refraction_scatter: dict[str, float] | None = None
+    refraction_scatter: dict[str, Number] | None = field(default=None, metadata=OMITTED_IF_EMPTY)
     """Scatter of the mean sphere between the frames of a burst; null for less than three frames."""
 
     regularisation: dict[str, Any] = field(default_factory=dict)
     """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""
 
-    noise_dn: float | None = None
+    noise_dn: Number | None = None
     """Standard deviation of the noise of one sensor pixel, in DN, at the mean light of the frame; of a burst: of the
     average of its frames, in DN of one exposure."""
 
-    residual: float | None = None
+    residual: Number | None = None
     """Rms of frame minus forward model in units of the noise; 1: only noise is left. Null if not computed."""
 
     quality: dict[str, Any] = field(default_factory=dict)
@@ -353,7 +430,7 @@ class Report:
     frames: tuple[FrameUse, ...] = (ONLY_FRAME,)
     """What became of each frame of the burst, in its order; one entry for one frame."""
 
-    channels: tuple[ChannelUse, ...] = ()
+    channels: tuple[ChannelUse, ...] = field(default=(), metadata=OMITTED_IF_EMPTY)
     """Colours of light of a colour picture; empty for a grey one."""
 
 

@@ -24,7 +24,7 @@ from services.backup.backup_key import KEY_FILE, key_for_recipients, read_key, w
 from services.delivery.visit_json import visit_as_json
 from services.errors import BackupDamaged, LoginRequired, RecordNotFound, StoreDamaged
 from services.http.authentication import PinAuthenticator
-from services.records.capture import Capture, CaptureReport, PictureVerdict
+from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG
@@ -73,7 +73,7 @@ def filled_store(folder: Path, *, with_log: bool) -> Path:
             for slot, eye in (("R-centre", "OD"), ("L-centre", "OS")):
                 key = next(keys)
                 target = people.pictures.capture_target(eye, key, visit, slot)
-                verdict = PictureVerdict("good", numbers={"level": 0.25 + number})
+                verdict = StoredVerdict("good", numbers={"level": 0.25 + number})
                 report = CaptureReport(visit=visit, slot=slot, verdict=verdict)
                 id = f"2026-{number}-{eye}"
                 taken = Capture(id, eye, clock.wall(), True, "00ff", report, {})

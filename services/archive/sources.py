@@ -137,7 +137,7 @@ def _refusal(folder: Path) -> str | None:
 def _stored(store: Path, place: Path, calibrations: Mapping[str, Path], unusable: Mapping[str, str]) -> FoundCapture:
     """Return one capture of a store; refused without a record, a raw frame or a calibration."""
     from services.errors import StoreDamaged
-    from services.records.capture_report import read_report
+    from services.records.capture import CaptureReport
     from services.records.record_files import RecordFiles  # deferred: imports SQLAlchemy, of the extra `instrument`
 
     found = FoundCapture(place.name, place / "raw.tiff")
@@ -150,7 +150,7 @@ def _stored(store: Path, place: Path, calibrations: Mapping[str, Path], unusable
     content = record.content
     digests = _digests(record.content.get("files"))
     try:
-        report = read_report(content.get("report"))
+        report = CaptureReport.read(content.get("report"))
     except (ValueError, KeyError) as error:
         return replace(found, refused=f"its report cannot be read: {error}")
     id = str(content.get("calibration_id"))
@@ -180,7 +180,7 @@ def _stored_frames(place: Path, digests: Mapping[str, str], report: CaptureRepor
     """Return the further frames of a stored capture, with the reasons why its report leaves some of them out."""
     from services.instrument.capture import FRAME_QUALITY  # deferred: imports SQLAlchemy
 
-    uses = report.reconstruction.frames
+    uses = report.frames
     reasons = {one.index: one.reason for one in uses if one.reason and one.reason.startswith(FRAME_QUALITY)}
     named = {path.stem: path for path in (place / name for name in digests) if path.suffix == ".tiff"}
     return tuple(

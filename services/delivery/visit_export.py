@@ -14,7 +14,6 @@ from services.delivery.visit_json import visit_as_json
 from services.imaging.picture_files import with_note
 from services.records.answers import IDENTIFIERS
 from services.records.capture import COLOUR, RecordOrigin
-from services.records.capture_report import origin_as_json, report_as_json
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import read_device
 from services.records.json_values import JsonObject
@@ -51,7 +50,7 @@ def _files(store: CaptureStore, visit: Visit, shown: JsonObject) -> dict[str, by
             files[f"{slot}-{number}.json"] = _report(store, taken.capture)
     plain = dict(shown) | {"fields": {key: value for key, value in visit.fields.items() if key not in IDENTIFIERS}}
     if device is not None:
-        plain["device"] = origin_as_json(device)
+        plain["device"] = device.as_json()
     files["visit.json"] = json.dumps(plain, indent=1, ensure_ascii=False).encode()
     sums = [f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items()]
     return files | {"SHA256SUMS": "".join(sums).encode()}
@@ -88,7 +87,7 @@ def _report(store: CaptureStore, id: str) -> bytes:
     stored = store.read(id, "report.json")
     if not capture.report.moved:
         return stored
-    report = report_as_json(capture.report)
+    report = capture.report.as_json()
     correction = {name: report[name] for name in ("slot", "moved")}
     return json.dumps(json.loads(stored) | {"eye": capture.eye} | correction, indent=1).encode()
 

@@ -1,6 +1,5 @@
 """JSON form of a visit in exports and uploads."""
 
-from services.records.capture_report import verdict_as_json
 from services.records.json_values import JsonValue
 from services.records.visit import SlotState, Visit
 
@@ -32,7 +31,7 @@ def _shown_slot(slot: SlotState) -> dict[str, JsonValue]:
         "state": slot.state,
         "capture": chosen.capture if chosen else None,
         "captures": [one.capture for one in slot.captures],
-        "verdict": verdict_as_json(verdict) if verdict else None,
+        "verdict": verdict.as_json() if verdict else None,
         "reason": slot.decision.reason if slot.decision else None,
         "tries": len(slot.captures),
     }

@@ -171,7 +171,7 @@ def reported_refractions(captures: Iterable[Capture]) -> list[ReportedRefraction
     """Return the refraction of each capture that shows an eye, and whose report has one with numbers."""
     found = []
     for one in filter(has_eye, captures):
-        report = one.report.reconstruction.refraction_dpt or {}
+        report = one.report.refraction_dpt or {}
         sphere, *edge = (report.get(name) for name in ("sphere", "field_deg", "field_deg_sd"))
         if isinstance(sphere, int | float):
             diameter_deg, sd_deg = (float(value) if isinstance(value, int | float) else 0.0 for value in edge)

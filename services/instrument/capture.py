@@ -6,27 +6,22 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-import numpy as np
-
 from device.light_safety.dose_report import DoseReport
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.exposure_split import ExposureSplit
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
-from device.values import EYES, Colour, Eye, Frame, Image, Report
+from device.values import EYES, Colour, Eye, Frame, Image, Report, Verdict
 from services.imaging import picture_files
 from services.imaging.colour_rendering import render_colour
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.press_exposure import Exposure
 from services.lru_cache import LruCache
 from services.records.blobs import FileContent, WrittenFile
-from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, PictureVerdict
+from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, StoredVerdict
 from services.records.capture_journal import InterruptedCapture
-from services.records.capture_report import read_report, report_as_json
 from services.records.capture_target import CaptureTarget, Permit, permit_test_picture
 from services.records.frame_writer import DARK, FIRST
 from services.records.idempotent_requests import key_conflict
-from services.records.json_values import JsonObject
 
 REMEMBERED = 32  # idempotency keys: a request that the network repeats makes one capture
 THUMBNAIL_PX = 640  # also of a quick look
@@ -159,7 +154,7 @@ def capture_files(
     green = picture_files.to_jpeg(shown, THUMBNAIL_PX, capture.simulated)
     thumbnail = green
     coloured = dict[str, FileContent]()
-    predicted = [one.name for one in capture.report.reconstruction.channels if one.predicted]
+    predicted = [one.name for one in capture.report.channels if one.predicted]
     if colour is not None:
         colour = render_colour(colour)
         coloured[COLOUR] = picture_files.to_png(colour, capture.simulated, note, predicted, picture_files.DISPLAY)
@@ -170,7 +165,7 @@ def capture_files(
         **coloured,
         "green.jpg": green,
         "quick.jpg": thumbnail,
-        "report.json": as_json(report_as_json(capture.report) | {"simulated": capture.simulated}),
+        "report.json": json.dumps(capture.report.as_json() | {"simulated": capture.simulated}, indent=1).encode(),
     }
 
 
@@ -199,26 +194,17 @@ def capture_report(
     `made`: report of the reconstruction; `verdict`: the final one; `seen`: laterality of the picture; `budget_s`: time
     budget in seconds.
     """
+    entries = vars(made) | vars(shot.light)
+    entries |= {
+        "seconds": {"expose": shot.exposure.duration_s, **made.seconds},
+        "warnings": (*made.warnings, *shot.notes),
+    }
     report = CaptureReport(
-        replace(
-            made, seconds={"expose": shot.exposure.duration_s, **made.seconds}, warnings=(*made.warnings, *shot.notes)
-        ),
-        shot.light,
-        shot.press.target.visit,
-        shot.press.target.slot,
-        PictureVerdict(verdict.word, verdict.code, verdict.numbers),
-        None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),
-        budget_s,
+        **entries,
+        visit=shot.press.target.visit,
+        slot=shot.press.target.slot,
+        verdict=StoredVerdict(**vars(verdict)),
+        laterality=None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),
+        budget_s=budget_s,
     )
-    return read_report(json.loads(as_json(report_as_json(report))))
-
-
-def as_json(data: JsonObject) -> bytes:
-    """Return indented JSON, UTF-8; numpy scalars become plain numbers, TypeError for other types."""
-    return json.dumps(data, indent=1, default=_plain).encode()
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{type(value)} does not belong into a report")
+    return CaptureReport.read(report.as_json())

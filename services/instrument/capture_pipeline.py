@@ -18,7 +18,6 @@ from device.errors import DiffuscopeError, FrameError
 from device.head import Head
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.exposure_split import WHOLE, ExposureSplit, PressLight, choose_split, dark_fits
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor, without_psf
 from device.recon.estimation.psf_selection import most_likely_psf
@@ -26,7 +25,19 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.reconstructor import Reconstructor, Step, default_schedule
 from device.recon.white_balance import light_dn_per_s
-from device.values import EYES, Calibration, ChannelUse, Colour, Counts, Eye, Frame, Image, Reconstruction, Report
+from device.values import (
+    EYES,
+    Calibration,
+    ChannelUse,
+    Colour,
+    Counts,
+    Eye,
+    Frame,
+    Image,
+    Reconstruction,
+    Report,
+    Verdict,
+)
 from services.imaging import picture_files
 from services.instrument.capture import FRAME_QUALITY, ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor

@@ -6,8 +6,7 @@ from types import MappingProxyType
 
 from device.errors import DiffuscopeError
 from device.recon.assessment.aiming import Aim
-from device.recon.assessment.frame_quality import Verdict
-from device.values import Image
+from device.values import Image, Verdict
 from services.imaging import picture_files
 from services.instrument.capture import THUMBNAIL_PX, Press, Preview
 from services.instrument.events import EventBus

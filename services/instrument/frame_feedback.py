@@ -5,11 +5,11 @@ import numpy as np
 from device.config.head_file import CameraSpec
 from device.errors import FrameError
 from device.recon.assessment.aiming import Aim, AimingGuide
-from device.recon.assessment.frame_quality import FrameQualityGate, Verdict, assess, assess_picture
+from device.recon.assessment.frame_quality import FrameQualityGate, assess, assess_picture
 from device.recon.assessment.laterality import Laterality, laterality
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.values import Calibration, Image, Report
+from device.values import Calibration, Image, Report, Verdict
 from services.records.capture import NO_METHOD
 from services.records.capture_target import CaptureTarget
 

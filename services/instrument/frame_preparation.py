@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from device.errors import FrameError
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
-from device.values import Colour, Counts, Frame, Image
+from device.values import Colour, Counts, Frame, Image, Verdict
 from services.instrument.frame_feedback import FrameAssessor
 
 Looked = Callable[[Image, bool], None]  # with the quick look of the first useful frame, and whether it is simulated

@@ -118,7 +118,7 @@ class MontageMaker:
             if chosen is None:
                 continue
             capture = self._store.get(chosen.capture)
-            if capture.report.reconstruction.method != NO_METHOD and PICTURE in capture.files:
+            if capture.report.method != NO_METHOD and PICTURE in capture.files:
                 found.append(VisitPicture(slot.id, capture.id, capture.files[PICTURE], capture.simulated))
         return tuple(found)
 

@@ -1,12 +1,16 @@
-"""Record of one stored capture and its report, as frozen values; their JSON is in capture_report.py."""
+"""Record of one stored capture and its report: the keys of `report.json`, of the database JSON and of the wire."""
 
-from dataclasses import dataclass, field, replace
+import dataclasses
+from collections.abc import Mapping
 from datetime import datetime
-from typing import Literal, Self
+from typing import Any, Literal, Self
+
+from pydantic import computed_field, field_validator
+from pydantic.dataclasses import dataclass
 
 from device.light_safety.dose_report import DoseReport
-from device.values import Eye, Report
-from services.records.json_values import JsonObject
+from device.values import OMITTED_IF_EMPTY, Eye, FrameUse, Number, Report, Verdict, Whole
+from services.records.stored_record import CONFIG, StoredRecord
 
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
 COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
@@ -14,102 +18,113 @@ OtherColour = Literal["red", "blue", "amber"]  # of light, besides the green one
 BUDGET_S = 5.0  # standard time budget, also of a report without one
 
 
-@dataclass(frozen=True)
-class PictureVerdict:
-    """Stored verdict on a picture: `word` ("good" or "again"), `code` of the cause (None if good), and the figures.
+@dataclass(frozen=True, config=CONFIG)
+class StoredVerdict(StoredRecord, Verdict):
+    """Verdict on the image quality of a stored picture."""
 
-    `others`: entries of the stored JSON that this release does not read; they are written again unchanged.
-    """
-
-    word: str | None = None
-    code: str | None = None
-    numbers: JsonObject = field(default_factory=dict)
-    others: JsonObject = field(default_factory=dict)
-
-    @property
-    def is_good(self) -> bool:
-        """Return whether the picture is good."""
-        return self.word == "good"
+    CHECKED = frozenset({"word"})
 
 
-@dataclass(frozen=True)
-class LateralityEstimate:
-    """Stored estimate of the eye that a picture shows; `eye` is None if uncertain.
-
-    `confidence`: 0 to 1; `disc`: (row, col) of the optic disc in the picture, None without an eye. `others`: as in
-    PictureVerdict.
-    """
+@dataclass(frozen=True, config=CONFIG)
+class LateralityEstimate(StoredRecord):
+    """Estimate of the eye that the picture shows."""
 
     eye: Eye | None = None
-    confidence: float = 0.0
-    disc: tuple[float, float] | None = None
-    others: JsonObject = field(default_factory=dict)
+    """OD (right) or OS (left); null if uncertain."""
+
+    confidence: Number = 0.0
+    """0 to 1."""
+
+    disc: tuple[Number, Number] | None = None
+    """Row and column of the optic disc in the picture, in pixels of the sensor."""
 
 
-@dataclass(frozen=True)
-class EyeCorrection:
-    """Move of a capture from the eye and slot that it was taken for to `eye`.
+@dataclass(frozen=True, config=CONFIG)
+class EyeConfirmation(StoredRecord):
+    """Confirmation of the recorded eye."""
 
-    `at`: time (ISO 8601); `by`: public name of the screen that requested the move, None for the instrument's own button
-    or a script. `others`: as in PictureVerdict.
-    """
+    eye: str | None = None
+    """Eye that is confirmed: OD (right) or OS (left)."""
+
+    at: str | None = None
+    """Time, ISO 8601."""
+
+    by: str | None = None
+    """Public name of the screen; null for the instrument's own button or a script."""
+
+
+@dataclass(frozen=True, config=CONFIG)
+class EyeCorrection(StoredRecord):
+    """Move of a capture to the other eye."""
+
+    CHECKED = frozenset({"from_eye", "from_slot"})
 
     from_eye: Eye
+    """Eye before the correction."""
+
     from_slot: str
-    eye: str | None = None
-    at: str | None = None
-    by: str | None = None
-    others: JsonObject = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class EyeConfirmation:
-    """Confirmation that the recorded eye of a capture is correct; fields as in EyeCorrection."""
+    """Picture slot before the correction."""
 
     eye: str | None = None
+    """Eye after the correction: OD (right) or OS (left)."""
+
     at: str | None = None
+    """Time, ISO 8601."""
+
     by: str | None = None
-    others: JsonObject = field(default_factory=dict)
+    """Public name of the screen; null for the instrument's own button or a script."""
 
 
 # Source of the date of a record: see services/health/clock_source.py; a browser is asked where nothing better is there.
 ClockState = Literal["not_set", "browser", "rtc", "network"]
 
 
-@dataclass(frozen=True)
-class RecordOrigin:
-    """Device, software, head and calibration that made a record, and the source of its date.
-
-    `uuid`, `serial`: of the device. `calibrated_at`: date of the calibration (ISO 8601); None for a simulated one.
-    `clock`: a ClockState, also one of a later release. `others`: as in PictureVerdict.
-    """
+@dataclass(frozen=True, config=CONFIG)
+class RecordOrigin(StoredRecord):
+    """Device, software, head and calibration that made a record, and the source of its date."""
 
     uuid: str | None = None
+    """UUID of the device, made with its data folder."""
+
     serial: str | None = None
+    """Serial number of its board."""
+
     software: str | None = None
+    """Version of the software."""
+
     head: str | None = None
+    """Name of the head."""
+
     calibration_id: str | None = None
+    """Identifier of the calibration."""
+
     calibrated_at: str | None = None
+    """Date of the calibration, ISO 8601; null for a simulated one."""
+
     clock: str | None = None
-    others: JsonObject = field(default_factory=dict)
+    """Source of the date: network, rtc (clock of the board), browser (of a tablet), or not_set: it may be too early."""
 
 
-@dataclass(frozen=True)
-class CaptureVersion:
-    """A later picture of a capture, made from its raw frames by `diffuscope archive run` and adopted by the store.
+@dataclass(frozen=True, config=CONFIG)
+class CaptureVersion(StoredRecord):
+    """A later picture of a capture, made from its raw frames by `diffuscope archive run` and adopted by the store."""
 
-    `number` is 1 for the first one; its files are `picture-<number>.png`, `report-<number>.json` and, in colour,
-    `colour-<number>.png`. `result`: name of the result, a digest of frames, calibration, software and settings. `at`:
-    time of the adoption (ISO 8601); `method`: of the reconstruction; `software`: version of the program. `others`: as
-    in PictureVerdict.
-    """
+    CHECKED = frozenset({"number", "result"})
 
-    number: int
+    number: Whole
+    """1 for the first one; its files are picture-1.png, report-1.json and, in colour, colour-1.png."""
+
     result: str
+    """Name of the result, a digest of frames, calibration, software and settings."""
+
     at: str | None = None
+    """Time of the adoption, ISO 8601."""
+
     method: str | None = None
+    """Method of the reconstruction."""
+
     software: str | None = None
-    others: JsonObject = field(default_factory=dict)
+    """Version of the program."""
 
     @property
     def picture(self) -> str:
@@ -127,59 +142,105 @@ class CaptureVersion:
         return f"report-{self.number}.json"
 
 
-@dataclass(frozen=True)
-class CaptureReport:
-    """Report of a capture: its reconstruction, light, visit and slot, verdict, laterality and time budget.
+@dataclass(frozen=True, config=CONFIG)
+class ShownReport(StoredRecord, DoseReport, Report):
+    """Report of a capture as endpoints return it: reconstruction, light, visit and slot, verdict, laterality, budget.
 
-    `reconstruction.seconds`: durations by stage, with the exposure. `visit` and `slot`: ids, None for a test picture.
-    `moved`: corrections of the eye, oldest first; `confirmed`: None unless the recorded eye was confirmed. `device`:
-    origin, None where it is unknown. `versions`: later pictures, oldest first. `others`: entries of the
-    stored JSON that this release does not read or that have another type; they are written again unchanged. A field
-    that is missing in the stored report has its default.
+    Its entries are the keys of `report.json`. `seconds` include the exposure.
     """
 
-    reconstruction: Report = field(default_factory=lambda: Report(NO_METHOD, frames=()))
-    light: DoseReport = field(default_factory=DoseReport)
-    visit: str | None = None
-    slot: str | None = None
-    verdict: PictureVerdict | None = None
-    laterality: LateralityEstimate | None = None
-    budget_s: float = BUDGET_S
-    moved: tuple[EyeCorrection, ...] = ()
-    confirmed: EyeConfirmation | None = None
-    device: RecordOrigin | None = None
-    versions: tuple[CaptureVersion, ...] = ()
-    others: JsonObject = field(default_factory=dict)
+    CHECKED = frozenset(
+        {"seconds", "refraction_dpt", "dose_j_per_cm2", "visit", "slot", "verdict", "budget_s", "moved"}
+    )
+    COMPUTED = frozenset({"test"})
 
+    method: str = NO_METHOD
+    frames: tuple[FrameUse, ...] = dataclasses.field(default=(), metadata=OMITTED_IF_EMPTY)
+
+    visit: str | None = None
+    """Identifier of the visit; null for a test picture."""
+
+    slot: str | None = None
+    """Picture slot of the programme, for example R-centre; null for a test picture."""
+
+    verdict: StoredVerdict | None = None
+    """Verdict for the operator."""
+
+    laterality: LateralityEstimate | None = None
+    """Estimate of the eye that the picture shows."""
+
+    budget_s: Number = BUDGET_S
+    """Time budget of the reconstruction in s."""
+
+    moved: tuple[EyeCorrection, ...] = dataclasses.field(default=(), metadata=OMITTED_IF_EMPTY)
+    """Corrections of the eye, oldest first; only if there are any."""
+
+    confirmed: EyeConfirmation | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Confirmation of the recorded eye; only if there is one."""
+
+    @computed_field  # type: ignore[prop-decorator]  # mypy knows no decorator above a property
     @property
-    def is_test(self) -> bool:
-        """Return whether the capture is a test picture: it belongs to no visit."""
+    def test(self) -> bool:
+        """True for a test picture, which belongs to no visit."""
         return self.visit is None
 
     @property
     def total_s(self) -> float:
         """Return the sum of the durations of all stages in s; 0 without any."""
-        return float(sum(self.reconstruction.seconds.values()))
+        return float(sum(self.seconds.values()))
+
+    @field_validator("seconds", "dose_24h_j_per_cm2", "refraction_scatter", mode="before")
+    @classmethod
+    def _without_null(cls, value: object) -> object:
+        """Return the numbers of an object: null is none."""
+        if not isinstance(value, Mapping):
+            return value
+        return {name: one for name, one in value.items() if one is not None}
+
+    @field_validator("refraction_dpt", mode="before")
+    @classmethod
+    def _refraction(cls, value: object) -> object:
+        """Return the numbers and nulls of a refraction, and the text of `refused`; only `sphere` is checked."""
+        if not isinstance(value, Mapping):
+            return value
+        if not _is_figure("sphere", value.get("sphere")):
+            raise ValueError("sphere: neither a number nor null")
+        return {name: one for name, one in value.items() if _is_figure(name, one)}
+
+
+@dataclass(frozen=True, config=CONFIG)
+class CaptureReport(ShownReport):
+    """Report of a capture as stored: with its origin, and the later versions of its picture."""
+
+    device: RecordOrigin | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Origin of the capture; null where it is unknown."""
+
+    versions: tuple[CaptureVersion, ...] = dataclasses.field(default=(), metadata=OMITTED_IF_EMPTY)
+    """Later pictures, oldest first; only if there are any."""
 
     def with_correction(self, slot: str, correction: EyeCorrection) -> Self:
         """Return a copy of the report with a new slot and one more correction of the eye."""
-        return replace(self, slot=slot, moved=(*self.moved, correction), others=_without(self.others, "slot", "moved"))
+        return self._with(slot=slot, moved=(*self.moved, correction))
 
     def with_confirmation(self, confirmation: EyeConfirmation) -> Self:
         """Return a copy of the report with this confirmation of the recorded eye."""
-        return replace(self, confirmed=confirmation, others=_without(self.others, "confirmed"))
+        return self._with(confirmed=confirmation)
 
     def with_version(self, version: CaptureVersion) -> Self:
         """Return a copy of the report with one more version of the picture."""
-        versions = (*self.versions, version)
-        return replace(self, versions=versions, others=_without(self.others, "versions"))
+        return self._with(versions=(*self.versions, version))
+
+    def _with(self, **changed: Any) -> Self:
+        others = {name: value for name, value in self.others.items() if name not in changed}
+        return dataclasses.replace(self, **changed, others=others)
 
 
-def _without(entries: JsonObject, *names: str) -> JsonObject:
-    return {name: value for name, value in entries.items() if name not in names}
+def _is_figure(name: str, value: object) -> bool:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return value is None or is_number or (name == "refused" and isinstance(value, str))
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Capture:
     """Record of one stored capture: id, eye, time, report, and the SHA-256 of each stored file by file name."""
 
@@ -198,4 +259,4 @@ class Capture:
 
     def with_files(self, files: dict[str, str]) -> Self:
         """Return a copy of the capture with `files`, the SHA-256 of each stored file by file name."""
-        return replace(self, files=files)
+        return dataclasses.replace(self, files=files)

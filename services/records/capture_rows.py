@@ -12,8 +12,7 @@ from sqlalchemy.orm import Session
 from device.values import EYES
 from services.errors import StoreDamaged
 from services.records import row_validation
-from services.records.capture import Capture
-from services.records.capture_report import parse_report
+from services.records.capture import Capture, CaptureReport
 from services.records.record_rows import FileEntry, capture_content
 from services.records.record_signing import refuse_changed
 from services.records.schema import CAPTURE_ROWID, CaptureRow, FileRow
@@ -80,7 +79,7 @@ def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[FileEntry]]) ->
             taken_at=row_validation.timestamp(row.taken_at),
             simulated=bool(row_validation.one_of(row.simulated, 0, 1)),
             calibration_id=row_validation.text(row.calibration_id),
-            report=parse_report(row.report),
+            report=CaptureReport.parse(row.report),
             files={row_validation.text(name): row_validation.text(digest) for name, digest, _ in files[row.id]},
         )
 

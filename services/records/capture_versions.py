@@ -20,8 +20,7 @@ from sqlalchemy.orm import Session
 from device import atomic_io
 from services.errors import RecordNotFound, VersionRefused
 from services.records import blobs, row_validation, schema
-from services.records.capture import CaptureVersion
-from services.records.capture_report import parse_report, report_as_json
+from services.records.capture import CaptureReport, CaptureVersion
 from services.records.capture_rows import NAME
 from services.records.record_signing import recorded
 from services.records.schema import CaptureRow, FileRow
@@ -67,7 +66,7 @@ class CaptureVersions:
         with storage_errors(), atomic_io.file_lock(self._lock), recorded(self._engine) as session:
             row = _row(session, new.capture)
             with row_validation.reading_record(row.id):
-                report = parse_report(row.report)
+                report = CaptureReport.parse(row.report)
             _refuse_foreign(new, row, None if report.device is None else report.device.uuid)
             known = next((one for one in report.versions if one.result == new.result), None)
             if known is not None:
@@ -75,7 +74,7 @@ class CaptureVersions:
             number = max((one.number for one in report.versions), default=0) + 1
             version = CaptureVersion(number, new.result, at.isoformat(), new.method, new.software)
             self._write(row, version, new)
-            row.report = schema.report_text(report_as_json(report.with_version(version)))
+            row.report = schema.report_text(report.with_version(version))
             return version
 
     def _write(self, row: CaptureRow, version: CaptureVersion, new: NewVersion) -> None:

@@ -11,10 +11,9 @@ from device.values import EYES, Eye
 from services.errors import RecordNotFound
 from services.records import row_validation, schema
 from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
-from services.records.capture_report import parse_report, report_as_json
 from services.records.dose_ledger_tables import add_given_dose
 from services.records.protocol import CHOOSE_REMEDY, Protocol, Slot
-from services.records.schema import CaptureRow, CaptureSlotRow, VisitRow
+from services.records.schema import CaptureRow, CaptureSlotRow, VisitRow, json_extract_or_null
 
 SEARCHED_CAPTURES = 8  # number of newest captures that are searched: more than a visit has
 OTHER_EYE: dict[str, Eye] = {"OD": "OS", "OS": "OD"}
@@ -36,10 +35,8 @@ def newest_question(session: Session) -> LateralityQuestion | None:
     there is none.
     """
     newest = select(CaptureRow.id).order_by(schema.CAPTURE_ROWID.desc()).limit(SEARCHED_CAPTURES)
-    seen = row_validation.json_extract_or_null(CaptureRow.laterality, "$.eye")
-    moved, confirmed = (
-        row_validation.json_extract_or_null(CaptureRow.report, f"$.{name}") for name in ("moved", "confirmed")
-    )
+    seen = json_extract_or_null(CaptureRow.laterality, "$.eye")
+    moved, confirmed = (json_extract_or_null(CaptureRow.report, f"$.{name}") for name in ("moved", "confirmed"))
     found = session.execute(
         select(CaptureRow.id, CaptureRow.eye, CaptureSlotRow.slot)
         .join(CaptureSlotRow, CaptureSlotRow.capture == CaptureRow.id)
@@ -102,12 +99,13 @@ def relabel(session: Session, shot: CaptureSlotRow, to: Slot, at: datetime, by: 
     """
     row = session.get_one(CaptureRow, shot.capture)
     from_eye = _eye(row)
-    report = _report(row).with_correction(to.id, EyeCorrection(from_eye, shot.slot, to.eye, at.isoformat(), by))
+    correction = EyeCorrection(from_eye, shot.slot, to.eye, at.isoformat(), by)
+    report = _report(row).with_correction(to.id, correction)
     counted = {from_eye, *(one.from_eye for one in report.moved)}
     if to.eye not in counted:
-        add_given_dose(session, to.eye, report.light.dose_j_per_cm2 or 0.0)
+        add_given_dose(session, to.eye, report.dose_j_per_cm2 or 0.0)
     row.eye = to.eye
-    row.report = schema.report_text(report_as_json(report))
+    row.report = schema.report_text(report)
     shot.slot = to.id
 
 
@@ -120,7 +118,7 @@ def _eye(row: CaptureRow) -> Eye:
 def _report(row: CaptureRow) -> CaptureReport:
     """Return the report of a capture; StoreDamaged if it cannot be read."""
     with row_validation.reading_record(row.id):
-        return parse_report(row.report)
+        return CaptureReport.parse(row.report)
 
 
 def confirm(session: Session, shot: CaptureSlotRow, at: datetime, by: str | None) -> None:
@@ -130,4 +128,4 @@ def confirm(session: Session, shot: CaptureSlotRow, at: datetime, by: str | None
     """
     row = session.get_one(CaptureRow, shot.capture)
     report = _report(row).with_confirmation(EyeConfirmation(row.eye, at.isoformat(), by))
-    row.report = schema.report_text(report_as_json(report))
+    row.report = schema.report_text(report)

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 
 from device.values import EYES
 from services.records import numbering, row_validation
-from services.records.capture_report import read_report
+from services.records.capture import CaptureReport
 from services.records.json_values import JsonObject, JsonValue
 from services.records.record_document import Kind, as_object, whole_number
 from services.records.schema import (
@@ -194,7 +194,7 @@ def capture_row(content: JsonObject) -> CaptureRow:
     if not files:
         raise ValueError("a capture without files")
     report = as_object(content["report"])
-    read_report(report)
+    CaptureReport.read(report)
     return CaptureRow(
         id=row_validation.text(content["id"]),
         eye=row_validation.one_of(content["eye"], *EYES),

@@ -9,9 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from typing import Any, TypeVar, cast
-
-from sqlalchemy import ColumnElement, SQLColumnExpression, case, func
+from typing import TypeVar, cast
 
 from services.errors import StoreDamaged
 from services.records.json_values import FormValue, JsonValue
@@ -44,11 +42,6 @@ def without_damaged(items: Sequence[Item], read: Callable[[Item], Value]) -> lis
         except StoreDamaged:
             continue
     return out
-
-
-def json_extract_or_null(column: SQLColumnExpression[str | None], path: str) -> ColumnElement[Any]:
-    """Return the SQL expression `json_extract(column, path)`, but NULL for invalid JSON instead of a failed query."""
-    return case((func.json_valid(column), func.json_extract(column, path)))
 
 
 def text(value: object) -> str:

@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
@@ -20,15 +19,19 @@ from sqlalchemy import (
     REAL,
     URL,
     CheckConstraint,
+    ColumnElement,
     Computed,
     Connection,
     Engine,
     ForeignKey,
     Index,
     Integer,
+    SQLColumnExpression,
     Text,
+    case,
     create_engine,
     event,
+    func,
     literal_column,
     text,
 )
@@ -37,9 +40,9 @@ from sqlalchemy.pool import ConnectionPoolEntry
 
 from device import atomic_io
 from device.errors import SettingError, StoreError
-from services.records.capture import Capture
-from services.records.capture_report import report_as_json
+from services.records.capture import Capture, CaptureReport
 from services.records.earlier_stores import refuse_earlier_tables
+from services.records.json_values import JsonValue
 
 DATABASE = "store.sqlite"
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -488,28 +491,26 @@ def utc_text(moment: datetime) -> str:
     return moment.astimezone(UTC).isoformat(timespec="microseconds")
 
 
-def report_text(report: Mapping[str, object]) -> str:
-    """Return a report as JSON text; NaN and infinity become null, numpy values plain numbers and lists.
+def report_text(report: CaptureReport) -> str:
+    """Return a report as JSON text; NaN and infinity become null.
 
     SettingError if a value of another type cannot be written as JSON.
     """
     try:
-        return json.dumps(_plain(report), allow_nan=False)
+        return json.dumps(_finite(report.as_json()), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise SettingError(f"the report cannot be written down: {error}") from error
 
 
-def _plain(value: Any) -> Any:
-    """Convert numpy values, mappings and tuples to JSON types, NaN and infinity to None; return others unchanged."""
+def _finite(value: JsonValue) -> JsonValue:
+    """Return a JSON value with null for NaN and infinity."""
     match value:
-        case np.generic() | np.ndarray():
-            return _plain(value.tolist())
         case float():
             return value if math.isfinite(value) else None
-        case Mapping():
-            return {str(key): _plain(item) for key, item in value.items()}
-        case list() | tuple():
-            return [_plain(item) for item in value]
+        case dict():
+            return {key: _finite(item) for key, item in value.items()}
+        case list():
+            return [_finite(item) for item in value]
     return value
 
 
@@ -524,6 +525,11 @@ def row_of(capture: Capture, lengths_bytes: Mapping[str, int]) -> CaptureRow:
         taken_at=utc_text(capture.taken_at),
         simulated=int(capture.simulated),
         calibration_id=capture.calibration_id,
-        report=report_text(report_as_json(capture.report)),
+        report=report_text(capture.report),
         files=[FileRow(name=name, sha256=digest, bytes=lengths_bytes[name]) for name, digest in capture.files.items()],
     )
+
+
+def json_extract_or_null(column: SQLColumnExpression[str | None], path: str) -> ColumnElement[Any]:
+    """Return the SQL expression `json_extract(column, path)`, but NULL for invalid JSON instead of a failed query."""
+    return case((func.json_valid(column), func.json_extract(column, path)))

@@ -6,7 +6,7 @@ from datetime import datetime
 from typing import Literal, cast
 
 from device.values import ChannelUse, Eye
-from services.records.capture import NO_METHOD, PictureVerdict
+from services.records.capture import NO_METHOD, StoredVerdict
 from services.records.json_values import FormValue
 from services.records.protocol import VISIONS, Protocol, Vision
 
@@ -24,7 +24,7 @@ class SlotCapture:
     """
 
     capture: str
-    verdict: PictureVerdict | None
+    verdict: StoredVerdict | None
     no_colour: str | None = None
 
     @property

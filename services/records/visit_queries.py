@@ -10,12 +10,14 @@ from collections.abc import Sequence
 from datetime import date
 from typing import get_args
 
+from pydantic import TypeAdapter
 from sqlalchemy import Integer, case, func, literal_column, select
 from sqlalchemy.orm import Session
 
+from device.values import ChannelUse
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import row_validation
-from services.records.capture_report import read_channels, read_verdict
+from services.records.capture import StoredVerdict
 from services.records.protocol import Protocol
 from services.records.record_rows import visit_contents
 from services.records.record_signing import refuse_changed
@@ -29,10 +31,12 @@ from services.records.schema import (
     IdentifierRow,
     SlotDecisionRow,
     VisitRow,
+    json_extract_or_null,
 )
 from services.records.visit import Outcome, OutcomeCode, SlotCapture, SlotDecision, SlotState, Visit, no_colour_of
 
 PAGE_ROWS = 500  # visits per query where all visits are read
+_CHANNELS = TypeAdapter(tuple[ChannelUse, ...])
 _ID = re.compile(r"[0-9A-Za-z-]{1,60}", re.ASCII)
 SlotKey = tuple[str, str]
 
@@ -80,7 +84,7 @@ def counts(session: Session, day: str | None) -> dict[str, int]:
 
     `day`: None for all days. `done` includes the last two.
     """
-    code = row_validation.json_extract_or_null(VisitRow.outcome, "$.code")
+    code = json_extract_or_null(VisitRow.outcome, "$.code")
     query = select(
         func.count(VisitRow.finished_at),
         func.count(),
@@ -190,8 +194,8 @@ def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[obj
             func.coalesce(CaptureRow.slot, CaptureSlotRow.slot),  # a capture with a damaged row keeps its slot
             CaptureSlotRow.capture,
             CaptureRow.verdict,
-            row_validation.json_extract_or_null(CaptureRow.report, "$.method"),
-            row_validation.json_extract_or_null(CaptureRow.report, "$.channels"),
+            json_extract_or_null(CaptureRow.report, "$.method"),
+            json_extract_or_null(CaptureRow.report, "$.channels"),
         )
         .outerjoin(
             CaptureRow, CaptureRow.id == CaptureSlotRow.capture
@@ -211,11 +215,11 @@ def _taken_capture(capture: object, verdict_json: object, method: object, channe
     A verdict that is missing or unreadable is None; so is `no_colour` with a report that is.
     """
     try:
-        verdict = None if verdict_json is None else read_verdict(row_validation.parsed_json(verdict_json))
+        verdict = None if verdict_json is None else StoredVerdict.parse(verdict_json)
     except (ValueError, TypeError, KeyError):
         verdict = None
     try:
-        channels = () if channels_json is None else read_channels(row_validation.parsed_json(channels_json))
+        channels = () if channels_json is None else _CHANNELS.validate_python(row_validation.parsed_json(channels_json))
         no_colour = None if method is None else no_colour_of(row_validation.text(method), channels)
     except (ValueError, TypeError, KeyError):
         no_colour = None

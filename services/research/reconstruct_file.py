@@ -65,23 +65,19 @@ class FileReport(Report):
     """Report of `diffuscope reconstruct`: that of the solver, with what was set and what the files were.
 
     The other figures of several PSFs are those of the brightest channel.
-
-    Attributes
-    ----------
-    solved
-        (rows, cols) in samples of the solved frame.
-    given
-        Options that replaced a choice of the program, `settings` of the method among them.
-    psf_channels
-        Number of PSFs for the channels of the raw; 1: one PSF for all.
-    bayer
-        Pattern of a mosaic; None: the raw is none.
     """
 
     solved: Shape = (0, 0)
+    """Rows and columns of the solved frame, in samples of bin x bin pixels."""
+
     given: dict[str, float | str | dict[str, float]] = field(default_factory=dict)
+    """Options that replaced a choice of the program, by name; those of the method are in `settings`."""
+
     psf_channels: int = 1
+    """Number of PSFs for the channels of the raw; 1: one PSF for all."""
+
     bayer: str | None = None
+    """Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."""
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,21 @@
 """JSON schema of `report.json`, generated from the typed report, with a description of every key.
 
-Every `report.json` has the fields of `Report`; that of `diffuscope reconstruct --report` also has the entries of
-FILES, that of a capture those of CAPTURE. `.venv/bin/python -m services.research.report_schema` writes
-`services/research/site/report.schema.json` again; a test compares the file with this module, and real reports with it.
+Every `report.json` has the fields of `Report`; that of `diffuscope reconstruct --report` is a `FileReport`, that of a
+capture a `CaptureReport`. The keys inside of their mappings are named here.
+`.venv/bin/python -m services.research.report_schema` writes `services/research/site/report.schema.json` again; a test
+compares the file with this module, and real reports with it.
 """
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import fields
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter
 
-from device.values import Report
+from services.records.capture import CaptureReport
 from services.records.json_values import JsonValue
+from services.research.reconstruct_file import FileReport
 
 FILE = Path(__file__).parent / "site" / "report.schema.json"
 
@@ -86,52 +88,6 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
-OPTIONAL = (
-    "frames",
-    "channels",
-    "psf_cylinder",
-    "refraction_scatter",
-)  # fields of `Report` that a capture without them does not write
-FRAME: Mapping[str, JsonValue] = {
-    "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
-    "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
-    "shift_px": {
-        "type": ["array", "null"],
-        "items": {"type": "number"},
-        "minItems": 2,
-        "maxItems": 2,
-        "description": "Rows and columns: what is at (r, c) of the reference, the first used frame of the channel, "
-        "stands at (r, c) plus this in the frame, in pixels of the sensor. Null if the frame was not registered.",
-    },
-    "weight": {"type": "number", "description": "Share of the frame in the joined frame, 0 to 1."},
-    "reason": {"type": ["string", "null"], "description": "Reason why the frame is not used; null if it is."},
-}
-CHANNEL: Mapping[str, JsonValue] = {
-    "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
-    "shift_px": {
-        "type": ["array", "null"],
-        "items": {"type": "number"},
-        "minItems": 2,
-        "maxItems": 2,
-        "description": "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at "
-        "(r, c) plus this in this channel, in pixels of the raw. Null for a predicted or a missing channel.",
-    },
-    "predicted": {"type": "boolean", "description": "True if the channel was computed from the others, not measured."},
-    "reason": {
-        "type": ["string", "null"],
-        "description": "Why the picture has not this colour; null for one that it has.",
-    },
-    "code": {
-        "type": ["string", "null"],
-        "description": "Name of this reason for programs: the code of an error, colour.psf (no PSF of this colour) or "
-        "colour.interrupted; null for a colour that the picture has.",
-    },
-    "white_ratio": {
-        "type": ["number", "null"],
-        "description": "Light of its frame over that of a white card in the same lamp light. Null without a white "
-        "reference in the calibration: the hue is then neutral, that of an average retina.",
-    },
-}
 VERDICT: Mapping[str, str] = {
     "saturated": "Share of saturated pixels of the raw frame, 0 to 1.",
     "light_e_per_um2": "Mean light on the sensor in electrons per um^2.",
@@ -146,155 +102,28 @@ VERDICT: Mapping[str, str] = {
 }
 
 
-def _typed(kind: str | list[JsonValue], text: str, **more: JsonValue) -> dict[str, JsonValue]:
-    return {"type": kind, "description": text, **more}
-
-
-def _number(text: str) -> dict[str, JsonValue]:
-    return _typed("number", text)
-
-
-def _figure(text: str) -> dict[str, JsonValue]:
-    return _typed(["number", "null"], text)
-
-
-def _text(text: str) -> dict[str, JsonValue]:
-    return _typed(["string", "null"], text)
-
-
-def _eye(text: str) -> dict[str, JsonValue]:
-    return {"enum": ["OD", "OS", None], "description": text}
-
-
-def _each(words: Mapping[str, str], entry: Callable[[str], dict[str, JsonValue]]) -> dict[str, JsonValue]:
-    """Return the schemas of entries by name, of the kind `entry`, with these descriptions."""
-    return {name: entry(text) for name, text in words.items()}
-
-
-EYE_AT_BY: dict[str, JsonValue] = {
-    "eye": _eye("Eye after the correction or confirmation: OD (right) or OS (left)."),
-    "at": _text("Time, ISO 8601."),
-    "by": _text("Public name of the screen; null for the instrument's own button or a script."),
-}
-FILES: Mapping[str, JsonValue] = {
-    "solved": _typed(
-        "array",
-        "Rows and columns of the solved frame, in samples of bin x bin pixels.",
-        items={"type": "integer"},
-        minItems=2,
-        maxItems=2,
-    ),
-    "given": _typed(
-        "object",
-        "Options that replaced a choice of the program, by name; those of the method are in `settings`.",
-        additionalProperties={"type": ["number", "string", "object"]},
-    ),
-    "psf_channels": _typed("integer", "Number of PSFs for the channels of the raw; 1: one PSF for all."),
-    "bayer": _text("Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."),
-}
-CAPTURE: Mapping[str, JsonValue] = {
-    "dose_j_per_cm2": _figure("Light dose of this exposure at the retina in J/cm2."),
-    "dose_24h_j_per_cm2": _typed(
-        "object",
-        "Light dose of each eye in the last 24 hours in J/cm2, with this exposure.",
-        properties={"OD": _number("Right eye."), "OS": _number("Left eye.")},
-    ),
-    "dose_stop_j_per_cm2": _figure("Dose in 24 hours at which an eye gets no more light, in J/cm2."),
-    "dose_high": _typed("array", "Eyes whose dose is above the warning.", items={"type": "string"}),
-    "limits_unchecked": _typed(
-        "array",
-        "Names of the light limits that were not compared with the purchased standard.",
-        items={"type": "string"},
-    ),
-    "visit": _text("Identifier of the visit; null for a test picture."),
-    "slot": _text("Picture slot of the programme, for example R-centre; null for a test picture."),
-    "test": _typed("boolean", "True for a test picture, which belongs to no visit."),
-    "verdict": _typed(
-        ["object", "null"],
-        "Verdict for the operator.",
-        properties={
-            "word": _text('"good" or "again".'),
-            "code": _text("Cause of the verdict, for example shot.moved; null if good."),
-            "numbers": _typed(
-                "object", "Known figures, to four significant digits.", properties=_each(VERDICT, _number)
-            ),
-        },
-    ),
-    "laterality": _typed(
-        ["object", "null"],
-        "Estimate of the eye that the picture shows.",
-        properties={
-            "eye": _eye("OD (right) or OS (left); null if uncertain."),
-            "confidence": _number("0 to 1."),
-            "disc": _typed(
-                ["array", "null"],
-                "Row and column of the optic disc in the picture, in pixels of the sensor.",
-                items={"type": "number"},
-                minItems=2,
-                maxItems=2,
-            ),
-        },
-    ),
-    "budget_s": _number("Time budget of the reconstruction in s."),
-    "moved": _typed(
-        "array",
-        "Corrections of the eye, oldest first; only if there are any.",
-        items={
-            "type": "object",
-            "properties": {
-                "from_eye": _eye("Eye before the correction."),
-                "from_slot": _text("Picture slot before the correction."),
-                **EYE_AT_BY,
-            },
-        },
-    ),
-    "confirmed": _typed("object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY),
-    "device": _typed(
-        "object",
-        "Origin of the capture; null where it is unknown.",
-        properties={
-            "uuid": _text("UUID of the device, made with its data folder."),
-            "serial": _text("Serial number of its board."),
-            "software": _text("Version of the software."),
-            "head": _text("Name of the head."),
-            "calibration_id": _text("Identifier of the calibration."),
-            "calibrated_at": _text("Date of the calibration, ISO 8601; null for a simulated one."),
-            "clock": _text(
-                "Source of the date: network, rtc (clock of the board), browser (of a tablet), or not_set: it may be "
-                "too early."
-            ),
-        },
-    ),
-    "simulated": _typed("boolean", "True if the frame shows no real eye."),
+NAMED: Mapping[str, Mapping[str, str]] = {
+    "seconds": SECONDS,
+    "psf_cylinder": PSF_CYLINDER,
+    "refraction_dpt": REFRACTION,
+    "refraction_scatter": SCATTER,
+    "regularisation": REGULARISATION,
+    "quality": QUALITY,
+    "dose_24h_j_per_cm2": {"OD": "Right eye.", "OS": "Left eye."},
 }
 
-
-def _refraction() -> dict[str, JsonValue]:
-    """Return the schemas of the entries of a refraction: a text for `refused`, a number for the others; or null."""
-    return {name: _text(text) if name == "refused" else _figure(text) for name, text in REFRACTION.items()}
+LEFT_OUT = ("$ref", "title", "default", "readOnly")  # of the schema of a record
 
 
 def report_schema() -> dict[str, JsonValue]:
     """Return the JSON schema (draft 2020-12) of `report.json`; every key has a description."""
-    properties = TypeAdapter(Report).json_schema(mode="serialization")["properties"]
-    for one in properties.values():
-        one.pop("title", None)
-    nested: dict[str, dict[str, JsonValue]] = {
-        "seconds": {
-            "type": "object",
-            "properties": _each(SECONDS, _number),
-            "additionalProperties": {"type": "number"},
-        },
-        "psf_cylinder": {"type": ["object", "null"], "properties": _each(PSF_CYLINDER, _figure)},
-        "refraction_dpt": {"type": ["object", "null"], "properties": _refraction()},
-        "refraction_scatter": {"type": ["object", "null"], "properties": _each(SCATTER, _number)},
-        "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
-        "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
-        "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},
-        "channels": {"type": "array", "items": {"type": "object", "properties": dict(CHANNEL)}},
-    }
-    for name, entries in nested.items():
-        properties[name] = {"description": properties[name]["description"], **entries}
+    capture, command = _schema(CaptureReport), _schema(FileReport)
+    entries = {**command["properties"], **capture["properties"]}
+    for name, words in NAMED.items():
+        _mapping(entries[name])["properties"] = {key: _named(key, text) for key, text in words.items()}
+    numbers = _mapping(entries["verdict"])["properties"]["numbers"]
+    numbers["properties"] = {key: {"type": "number", "description": text} for key, text in VERDICT.items()}
+    simulated: dict[str, JsonValue] = {"type": "boolean", "description": "True if the frame shows no real eye."}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "report.json of Diffuscope",
@@ -304,9 +133,35 @@ def report_schema() -> dict[str, JsonValue]:
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",
-        "properties": {**properties, **FILES, **CAPTURE},
-        "required": [one.name for one in fields(Report) if one.name not in OPTIONAL],
+        "properties": {**entries, "simulated": simulated},
+        "required": [name for name in command["required"] if name in capture["required"]],
     }
+
+
+def _schema(kind: type) -> Any:
+    """Return the JSON schema of a record, with the parts of it in their places and without titles."""
+    schema = TypeAdapter(kind).json_schema(mode="serialization")
+    parts = schema.pop("$defs")
+
+    def placed(value: Any) -> Any:
+        if isinstance(value, list):
+            return [placed(one) for one in value]
+        if not isinstance(value, dict):
+            return value
+        part = placed(parts[value["$ref"].rpartition("/")[2]]) if "$ref" in value else {}
+        return part | {key: placed(one) for key, one in value.items() if key not in LEFT_OUT}
+
+    return placed(schema)
+
+
+def _mapping(entry: Any) -> Any:
+    """Return the part of the schema of an entry that is an object; the other part is null."""
+    return next(one for one in (entry, *entry.get("anyOf", ())) if one.get("type") == "object")
+
+
+def _named(key: str, text: str) -> dict[str, JsonValue]:
+    """Return the schema of a figure in an object: a number or null, but for the reason of a refusal a text or null."""
+    return {"type": ["string" if key == "refused" else "number", "null"], "description": text}
 
 
 def schema_text() -> str:

@@ -84,7 +84,7 @@ def test_whole_captures_are_computed_as_the_instrument_does(
     store, (burst, other, single) = taken
     for capture in (burst, other):
         row = rows.loc[capture.id]
-        used = [one.used for one in capture.report.reconstruction.frames]  # a burst may leave out a frame of it
+        used = [one.used for one in capture.report.frames]  # a burst may leave out a frame of it
         assert (row["frames"], row["frames_used"]) == (len(used), sum(used))
         assert list(row["channels"]) == ["green", "red"]
         assert list(row["predicted_channels"]) == ["blue"]

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from device.clock import SystemClock
-from services.records.capture import Capture, CaptureReport, PictureVerdict
+from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
 from services.records.quarantine import REQUIRED_FILES
 from tests.bench import timing
@@ -125,7 +125,7 @@ def measure_openings(folder: Path) -> None:
         place, clock = folder / f"store-{number}", SystemClock()
         with CaptureStore(place, reserve_bytes=0) as store:
             for k in range(number):
-                report = CaptureReport(verdict=PictureVerdict("good", numbers={"level": 0.25}))
+                report = CaptureReport(verdict=StoredVerdict("good", numbers={"level": 0.25}))
                 store.save(Capture(f"c{k}", "OD", clock.wall(), True, "00ff", report, {}), files)
         timing.row("records in files", str(number), _opening_s(place), _rebuilding_s(place))
         shutil.rmtree(place)

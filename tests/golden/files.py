@@ -33,7 +33,6 @@ from services.errors import PinWrong, ReceiverUnreachable
 from services.http.authentication import PinAuthenticator
 from services.instrument.accuracy_explorer import AccuracyExplorer
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
-from services.records.capture_report import report_as_json
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
@@ -188,7 +187,7 @@ def _read_store(store: CaptureStore) -> dict[str, Any]:
             "taken_at": one.taken_at.isoformat(),
             "simulated": one.simulated,
             "calibration": one.calibration_id,
-            "report": report_as_json(one.report),
+            "report": one.report.as_json(),
             "files": dict(one.files),
             "sizes": {name: len(store.read(one.id, name)) for name in one.files},
         }

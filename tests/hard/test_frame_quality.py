@@ -15,11 +15,11 @@ import pytest
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.recon.assessment.aiming import AimingGuide, moved_samples
-from device.recon.assessment.frame_quality import FrameFigures, FrameQualityGate, Verdict, assess, assess_picture
+from device.recon.assessment.frame_quality import FrameFigures, FrameQualityGate, assess, assess_picture
 from device.sim import calibration_targets
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import Calibration, Counts, Image
+from device.values import Calibration, Counts, Image, Verdict
 from tests import scenes
 from tests.simulated import SCENES, coarse, exposed_counts, with_keys
 

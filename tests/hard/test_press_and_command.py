@@ -66,7 +66,7 @@ def reconstructed(root: Path, capture: Capture, *frames: str) -> tuple[Any, Any]
 
 def test_a_burst_has_the_residual_and_the_picture_of_its_press(pressed: tuple[Path, Capture]) -> None:
     root, capture = pressed
-    stored, place = capture.report.reconstruction, root / "store" / "captures" / capture.id
+    stored, place = capture.report, root / "store" / "captures" / capture.id
     names = burst_of(capture)
     picture, report = reconstructed(root, capture, *names)
     assert [one["used"] for one in report["frames"]] == [one.used for one in stored.frames]
@@ -82,7 +82,7 @@ def test_a_burst_has_the_residual_and_the_picture_of_its_press(pressed: tuple[Pa
 
 def test_a_colour_press_is_repeated_with_its_calibration(pressed: tuple[Path, Capture]) -> None:
     root, capture = pressed
-    stored, place = capture.report.reconstruction, root / "store" / "captures" / capture.id
+    stored, place = capture.report, root / "store" / "captures" / capture.id
     channels = [word for name in burst_of(capture) for word in ("--channel", "green", name)]
     picture, report = reconstructed(root, capture, *channels, "--channel", "red", "raw-red.tiff")
     assert report["residual"] == pytest.approx(stored.residual, rel=0.02)
@@ -99,7 +99,7 @@ def test_a_colour_press_is_repeated_with_its_calibration(pressed: tuple[Path, Ca
 
 
 def burst_of(capture: Capture) -> list[str]:
-    return ["raw.tiff", *(f"raw-{k}.tiff" for k in range(1, len(capture.report.reconstruction.frames)))]
+    return ["raw.tiff", *(f"raw-{k}.tiff" for k in range(1, len(capture.report.frames)))]
 
 
 def likeness(picture: Any, shown: Any) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from services.records.capture_report import read_report, report_as_json
+from services.records.capture import CaptureReport
 from tests.journey.asking import record_answer, visit_with_consent
 from tests.journey.conftest import MakeRig, Rig, until
 from tests.journey.faults import wait_until_idle
@@ -137,8 +137,8 @@ def test_capture_without_a_visit_stays_a_test_picture(old_rig: Rig) -> None:
 
 def test_capture_of_an_earlier_release_without_a_visit_is_a_test_picture(old_rig: Rig) -> None:
     made = old_rig.store.get(old_rig.request("POST", "/api/captures", json={"eye": "OD"}).json()["id"])
-    stored = report_as_json(made.report)
-    earlier = read_report({key: value for key, value in stored.items() if key not in ("visit", "slot", "test")})
+    stored = made.report.as_json()
+    earlier = CaptureReport.read({key: value for key, value in stored.items() if key not in ("visit", "slot", "test")})
     capture = type(made)(f"{made.id}-e", made.eye, made.taken_at, made.simulated, made.calibration_id, earlier, {})
     old_rig.store.save(capture, {"report.json": b"{}"})
     assert old_rig.request("GET", f"/api/captures/{capture.id}").json()["test"] is True

@@ -22,7 +22,6 @@ from services.errors import Busy
 from services.imaging.picture_files import read_raw_tiff, to_png
 from services.instrument.capture_pipeline import CapturePipeline, crop_to_field, plan_pipeline
 from services.instrument.events import EventBus
-from services.records.capture_report import report_as_json
 from tests.journey.asking import live_picture
 from tests.journey.conftest import until
 
@@ -44,7 +43,7 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
     assert dark_metadata.illumination is None
     assert metadata.eye == kept.eye == "OS"
     report = json.loads(old_rig.store.read(kept.id, "report.json"))
-    assert report == report_as_json(kept.report) | {"simulated": True}
+    assert report == kept.report.as_json() | {"simulated": True}
     assert report["stopped"] == "done"
     assert report["bin"] == 1
     assert [frame["used"] for frame in report["frames"]] == [True] * 4
@@ -224,7 +223,7 @@ def test_closed_frames_of_a_burst_are_left_out_of_the_picture(make_rig: Any, clo
     rig = make_rig(camera=lambda camera: Blinking(camera, closed))
     kept = rig.exam.press("OD").result(30)
     assert kept.report.verdict.word == "good"
-    frames = kept.report.reconstruction.frames
+    frames = kept.report.frames
     assert len(frames) == 4
     assert frames[0].used, "the first good frame is the reference"
     assert [one.used for one in frames].count(True) == 4 - len(closed)
@@ -252,7 +251,7 @@ def test_a_press_suspends_a_refinement_which_resumes_to_the_same_picture(make_ri
     a, b = first.id, second.id
     taken = ("expose", "expose", "quick")  # the second with the first quick look
     assert order[:7] == [*((a, stage) for stage in taken), *((b, stage) for stage in taken), (a, "keep")]
-    assert first.report.reconstruction.rounds == second.report.reconstruction.rounds > 5
+    assert first.report.rounds == second.report.rounds > 5
     *raws, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in (*RAWS, "dark.tiff"))
     bursts = planned(rig, plans).bursts
     assert bursts is not None
@@ -415,8 +414,8 @@ def test_a_capture_without_reconstruction_is_stored(rig: Any) -> None:
     rig.world.ambient_e_per_s = 1e7  # daylight saturates every pixel
     bright = rig.exam.press("OD").result(30)
     assert bright.report.verdict.code == "shot.saturated"
-    assert (bright.report.reconstruction.method, bright.report.reconstruction.stopped) == ("none", "input.frame")
-    assert "cannot be used" in bright.report.reconstruction.warnings[0]
+    assert (bright.report.method, bright.report.stopped) == ("none", "input.frame")
+    assert "cannot be used" in bright.report.warnings[0]
     raw, metadata = read_raw_tiff(rig.store.read(bright.id, "raw.tiff"))
     assert raw.min() == raw.max() > 4000
     assert metadata.illumination == Illumination("green")

@@ -251,7 +251,7 @@ def test_a_laterality_question_stands_until_it_is_answered(rig: Rig, equipped: t
     slots = answer_laterality(rig, moved, "OS")
     assert (slots["R-centre"]["state"], slots["L-centre"]["capture"]) == ("empty", moved)
     assert laterality_question(rig) is None
-    dose = rig.store.get(moved).report.light.dose_j_per_cm2
+    dose = rig.store.get(moved).report.dose_j_per_cm2
     assert dose > 0
     moved_doses = ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")
     assert moved_doses == (rest[0], pytest.approx(rest[1] + dose)), "the dose is added to the other eye as well"

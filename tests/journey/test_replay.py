@@ -142,7 +142,7 @@ def test_the_right_psf_of_a_stack_is_found(folder: Path, play: Played) -> None:
         psf = scenes.speckle(SHAPE, seed)
         tifffile.imwrite(folder / f"psf{index}.tiff", psf)
     kept, _ = play(folder)
-    assert kept.report.reconstruction.psf_index == 1
+    assert kept.report.psf_index == 1
 
 
 def test_a_float_recording_is_put_on_counts_by_one_scale(folder: Path, play: Played) -> None:
@@ -158,7 +158,7 @@ def test_a_float_recording_is_put_on_counts_by_one_scale(folder: Path, play: Pla
     assert head.calibration.bad is not None
     assert head.calibration.bad.sum() == 5
     kept, _ = play(folder)
-    assert kept.report.reconstruction.stopped == "done"
+    assert kept.report.stopped == "done"
 
 
 def test_a_recording_in_three_channels_gives_a_picture_in_colour(folder: Path, play: Played) -> None:
@@ -302,7 +302,7 @@ def test_a_real_recording_gives_a_picture_after_one_press(
 ) -> None:
     kept, exam = play(RECORDINGS / name)
     assert kept.simulated is False
-    assert exam.head.calibration.psfs[kept.report.reconstruction.psf_index].name == psf
+    assert exam.head.calibration.psfs[kept.report.psf_index].name == psf
     with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
         pixels = np.asarray(picture).astype(float)
     assert pixels.shape == shape

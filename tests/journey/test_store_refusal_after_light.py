@@ -180,7 +180,7 @@ def test_a_picture_that_cannot_be_stored_is_made_at_the_next_start(
         until(lambda: rig.store.captures() != [], 60)
         (kept,) = rig.store.captures()
         assert set(frames) <= set(kept.files)
-        assert WHOLE in kept.report.reconstruction.warnings
+        assert WHOLE in kept.report.warnings
         assert rig.world.frames == 0, "nothing is exposed again"
         assert rig.exam.head.light.ledger.spent_j_per_cm2("OD") == pytest.approx(spent_j_per_cm2)
         until(lambda: list((rig.store.folder / "journal").iterdir()) == [])

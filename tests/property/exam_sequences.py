@@ -34,7 +34,6 @@ from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
 from device.ports import Camera
 from device.recon.assessment.aiming import Aim
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import ROUND_DONE, Recipe, StageResult, Step
@@ -42,7 +41,17 @@ from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import Calibration, ExposureSettings, Eye, Frame, Illumination, Image, Reconstruction, Report
+from device.values import (
+    Calibration,
+    ExposureSettings,
+    Eye,
+    Frame,
+    Illumination,
+    Image,
+    Reconstruction,
+    Report,
+    Verdict,
+)
 from services.errors import Busy, ConsentDeclined
 from services.http.control_lease import ControlLease
 from services.imaging.picture_files import read_raw_tiff

@@ -11,9 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device.values import Report
 from services.records.capture import Capture, CaptureReport, EyeConfirmation, EyeCorrection
-from services.records.capture_report import read_report, report_as_json
 from services.records.capture_store import CaptureStore
 
 # Keys of the reports of each release on `main`, with a value as that release wrote it.
@@ -130,27 +128,27 @@ def same(one: object, other: object) -> bool:
 @given(stored_reports())
 def test_the_writer_returns_every_stored_entry(stored: dict[str, Any]) -> None:
     try:
-        report = read_report(stored)
+        report = CaptureReport.read(stored)
     except (ValueError, KeyError):
         return  # an entry on which the program acts has a wrong type: a damaged record, whose text stays as it is
-    written = report_as_json(report)
+    written = report.as_json()
     assert {name: value for name, value in stored.items() if not same(written.get(name), value)} == {}
-    assert read_report(written) == report
-    assert same(report_as_json(read_report(written)), written)
+    assert CaptureReport.read(written) == report
+    assert same(CaptureReport.read(written).as_json(), written)
 
 
 @given(values)
 def test_any_json_is_read_or_refused_as_a_damaged_record(stored: Any) -> None:
     with suppress(ValueError, KeyError):
-        read_report(stored)
+        CaptureReport.read(stored)
 
 
 @pytest.mark.parametrize("stored", RELEASES)
 def test_the_report_of_each_release_is_read_and_missing_entries_have_their_default(stored: dict[str, Any]) -> None:
-    report, default = read_report(stored), CaptureReport()
+    report, default = CaptureReport.read(stored), CaptureReport()
     assert report.others == {}
-    assert report.reconstruction.method == "variation"
-    assert (report.visit, report.is_test) == (stored.get("visit"), "visit" not in stored)
+    assert report.method == "variation"
+    assert (report.visit, report.test) == (stored.get("visit"), "visit" not in stored)
     assert (report.verdict is None) == ("verdict" not in stored)
     if "laterality" not in stored:
         assert (report.laterality, report.budget_s) == (default.laterality, default.budget_s)
@@ -159,38 +157,41 @@ def test_the_report_of_each_release_is_read_and_missing_entries_have_their_defau
 
 
 def test_an_empty_report_has_every_default_and_no_correction() -> None:
-    assert read_report({}) == CaptureReport()
-    assert set(report_as_json(CaptureReport())) == set(KEYS) - set(CORRECTED) - set(FRAMES) - set(ORIGIN) - set(WARPED)
+    assert CaptureReport.read({}) == CaptureReport()
+    assert set(CaptureReport().as_json()) == set(KEYS) - set(CORRECTED) - set(FRAMES) - set(ORIGIN) - set(WARPED)
 
 
 @given(stored_reports(), st.sampled_from(["R-nerve", "L-nerve"]))
 def test_a_correction_changes_slot_and_moves_only(stored: dict[str, Any], slot: str) -> None:
     try:
-        before = read_report(stored)
+        before = CaptureReport.read(stored)
     except (ValueError, KeyError):
         return
     move = EyeCorrection("OD", "R-centre", "OS", "2026-03-02T12:16:00+00:00", "tablet 1")
-    written, earlier = report_as_json(before.with_correction(slot, move)), report_as_json(before)
+    written, earlier = before.with_correction(slot, move).as_json(), before.as_json()
     assert written["slot"] == slot
     moved = written["moved"]
     assert isinstance(moved, list)
     assert same(moved[:-1], earlier.get("moved") or [])
-    assert read_report(written).moved == (*before.moved, move)
+    assert CaptureReport.read(written).moved == (*before.moved, move)
     other = {name: value for name, value in written.items() if name not in ("slot", "moved")}
     assert same(other, {name: value for name, value in earlier.items() if name not in ("slot", "moved")})
-    confirmed = report_as_json(before.with_confirmation(EyeConfirmation("OD")))
+    confirmed = before.with_confirmation(EyeConfirmation("OD")).as_json()
     assert confirmed["confirmed"] == {"eye": "OD", "at": None, "by": None}
 
 
 @given(st.dictionaries(texts, numbers, max_size=3), st.integers(0, 100), st.booleans())
 def test_what_is_built_is_read_again(seconds: dict[str, float], rounds: int, test: bool) -> None:
     built = CaptureReport(
-        Report("evidence", rounds=rounds, seconds=seconds, warnings=("dim",)),
+        "evidence",
+        rounds=rounds,
+        seconds=seconds,
+        warnings=("dim",),
         visit=None if test else "v",
         slot=None if test else "R-centre",
         moved=(EyeCorrection("OS", "L-centre", "OD"),),
     )
-    assert read_report(json.loads(json.dumps(report_as_json(built)))) == built
+    assert CaptureReport.read(json.loads(json.dumps(built.as_json()))) == built
 
 
 @pytest.fixture(scope="module")

@@ -32,10 +32,9 @@ from device.config.head_file import load_head
 from device.config.marked_files import marked_pixels, stated_in, stated_mark, tiff_bytes, write_npy
 from device.light_safety.dose_report import DoseReport
 from device.ports import Camera
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.reconstructor import Recipe
 from device.sim.scene_files import simulate_exposure
-from device.values import Counts, ExposureSettings, Frame, Illumination, Report, SimulatedCounts
+from device.values import Counts, ExposureSettings, Frame, Illumination, SimulatedCounts, Verdict
 from services.archive.plan import read_plan
 from services.archive.result import ResultFolder
 from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
@@ -353,7 +352,7 @@ def test_encoded_files_of_a_capture(simulated: bool) -> None:
     shot = ExposedCapture(
         press, "a", at, Exposure((exposed,), {}, None, 0.0, 0.2, 0.0), DoseReport(), Verdict("good", None, {})
     )
-    capture = Capture("a", "OD", at, simulated, "c", CaptureReport(Report("tikhonov"), light=DoseReport()), {})
+    capture = Capture("a", "OD", at, simulated, "c", CaptureReport("tikhonov"), {})
     files = capture_files(capture, "head", shot, picture, np.stack([picture] * 3, axis=2))
     for name, content in files.items():
         assert isinstance(content, bytes)

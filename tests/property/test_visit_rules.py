@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from device.errors import InputError
-from services.records.capture import PictureVerdict
+from services.records.capture import StoredVerdict
 from services.records.numbering import (
     automatic_number,
     check_digit,
@@ -78,7 +78,7 @@ def test_the_published_example_of_the_check_digit() -> None:
 
 
 taken = st.builds(
-    lambda name, word: SlotCapture(name, None if word is None else PictureVerdict(word)),
+    lambda name, word: SlotCapture(name, None if word is None else StoredVerdict(word)),
     st.from_regex("[a-z]{8}", fullmatch=True),
     st.sampled_from(["good", "again", None]),
 )

@@ -8,7 +8,7 @@ import tifffile
 from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
 from device.errors import SettingError
-from device.values import FrameUse, Report
+from device.values import FrameUse
 from services.archive.content import NAME_DIGITS, different_versions, result_name, software
 from services.archive.plan import Plan, PlanSettings, read_plan, write_plan
 from services.archive.planning import make_plan
@@ -195,7 +195,7 @@ def test_a_stored_burst_is_planned_whole_with_what_the_instrument_left_out(scene
     kept = Archive(tmp_path / "calibrations" / "tiny-head")
     id = kept.add_and_activate(made, Provenance("D1", VirtualClock().wall(), "test", "0"))
     uses = tuple(FrameUse(k, k != 1, None, 0.0, "frame quality: shot.moved" if k == 1 else None) for k in range(3))
-    report = CaptureReport(Report("variation", frames=uses), device=RecordOrigin(uuid="here"))
+    report = CaptureReport("variation", frames=uses, device=RecordOrigin(uuid="here"))
     files = {f"{name}.tiff": name.encode() for name in ("raw", "raw-1", "raw-2", "raw-red", "dark")}
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         for name in ("a", "b"):

@@ -15,7 +15,6 @@ from device.head import Head, hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
 from device.recon.assessment.exposure_split import WHOLE
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.colour_reconstructor import without_psf
 from device.recon.model.kernels import Pixels
@@ -24,7 +23,16 @@ from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import ChannelUse, Colour, ExposureSettings, Frame, Illumination, Reconstruction, WhiteReference
+from device.values import (
+    ChannelUse,
+    Colour,
+    ExposureSettings,
+    Frame,
+    Illumination,
+    Reconstruction,
+    Verdict,
+    WhiteReference,
+)
 from services.instrument.capture import ExposedCapture, Press, split_notes
 from services.instrument.capture_pipeline import CapturePipeline
 from services.instrument.press_exposure import expose_live, expose_press
@@ -128,7 +136,7 @@ def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
     capture = record.capture
     assert (capture.id, capture.eye, capture.simulated) == (shot.id, "OD", True)
     assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
-    assert capture.report.reconstruction.seconds["expose"] == pytest.approx(shot.exposure.duration_s)
+    assert capture.report.seconds["expose"] == pytest.approx(shot.exposure.duration_s)
     assert set(record.files()) == {"raw.tiff", "dark.tiff", "picture.png", "green.jpg", "quick.jpg", "report.json"}
 
 

@@ -24,7 +24,6 @@ from device.values import Report
 from services.errors import NO_FILES_REMEDY, RecordNotFound, StoreDamaged
 from services.records import schema
 from services.records.capture import Capture, CaptureReport
-from services.records.capture_report import read_report
 from services.records.capture_store import CaptureStore
 from services.records.quarantine import REQUIRED_FILES
 
@@ -34,7 +33,7 @@ FILES = {"raw.tiff": b"raw" * 1000, "picture.png": b"", "report.json": b"{}"}
 
 
 def capture(name: str = "20260301T120000-OD-aa", taken_at: datetime = NOON, **report: object) -> Capture:
-    return Capture(name, "OD", taken_at, True, "00ff", read_report(report), {})
+    return Capture(name, "OD", taken_at, True, "00ff", CaptureReport.read(report), {})
 
 
 @pytest.fixture
@@ -70,9 +69,9 @@ def test_a_timestamp_is_stored_in_utc(store: CaptureStore) -> None:
 
 def test_numbers_of_a_report_that_json_does_not_have_become_null(store: CaptureStore) -> None:
     made = Report("wiener", residual=float("nan"), noise_dn=np.float32(1.5), warnings=("dim",), quality={"a": [np.inf]})
-    store.save(replace(capture(), report=CaptureReport(made)), FILES)
-    kept = store.get(capture().id).report.reconstruction
-    assert kept == Report("wiener", noise_dn=1.5, warnings=("dim",), quality={"a": [None]})
+    store.save(replace(capture(), report=CaptureReport(**vars(made))), FILES)
+    kept = store.get(capture().id).report
+    assert kept == CaptureReport(**vars(made) | {"residual": None, "quality": {"a": [None]}})
     with pytest.raises(SettingError, match="cannot be written down"):
         store.save(capture("b", at=object()), FILES)
     assert [path.name for path in (store.folder / "captures").iterdir()] == [capture().id]

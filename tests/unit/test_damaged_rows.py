@@ -16,9 +16,8 @@ from device.clock import VirtualClock
 from device.errors import DiffuscopeError
 from services.delivery.visit_json import visit_as_json
 from services.errors import RecordNotFound, StoreDamaged
-from services.records.capture import Capture
+from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal
-from services.records.capture_report import read_report, report_as_json
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
@@ -73,7 +72,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
             people.answer(next(keys), visit, "complaints", ["flashes", "red"])
             people.answer(next(keys), visit, "name", f"Name{number}")
             target = people.pictures.capture_target("OD", next(keys), visit, "R-centre")
-            report = read_report(REPORT | {"visit": visit, "slot": "R-centre"})
+            report = CaptureReport.read(REPORT | {"visit": visit, "slot": "R-centre"})
             taken = Capture(f"c{number}", "OD", clock.wall(), True, "00ff", report, {})
             store.save(taken, FILES, target.write_rows)
             people.pictures.accept_capture(next(keys), f"c{number}")
@@ -142,7 +141,7 @@ def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
         assert len(visits) + people.damaged() == 3, change_made
     written = (
         [visit_as_json(visit) for visit in visits],
-        [report_as_json(capture.report) for capture in captures],
+        [capture.report.as_json() for capture in captures],
     )
     json.dumps(written, allow_nan=False, ensure_ascii=False).encode()
     assert set(people.counts()) == {"done", "to_finish", "referred", "declined"}

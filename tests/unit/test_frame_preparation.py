@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from device.errors import FrameError
-from device.recon.assessment.frame_quality import Verdict
 from device.recon.burst import SeenFrame
 from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.reconstructor import Recipe, StageResult
-from device.values import Colour, Frame, Illumination, Image
+from device.values import Colour, Frame, Illumination, Image, Verdict
 from services.instrument.frame_preparation import FramePreparation
 
 USELESS, FATAL = 0, 99  # numbers of frames that cannot be prepared, and that raise an unknown exception

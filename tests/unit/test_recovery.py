@@ -16,7 +16,7 @@ from device.clock import VirtualClock
 from device.errors import SettingError, StoreError
 from services.errors import StoreDamaged
 from services.records import schema
-from services.records.capture import Capture, CaptureReport, PictureVerdict
+from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
@@ -39,7 +39,7 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
 
 
 def saved(store: CaptureStore, id: str) -> Capture:
-    made = CaptureReport(verdict=PictureVerdict("good", numbers={"level": 0.25}), budget_s=2.5)
+    made = CaptureReport(verdict=StoredVerdict("good", numbers={"level": 0.25}), budget_s=2.5)
     return store.save(Capture(id, "OD", VirtualClock().wall(), True, "00ff", made, {}), FILES)
 
 
@@ -78,7 +78,7 @@ def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> 
     people = VisitRepository(store.engine, load_protocol(), VirtualClock())
     visit = people.answer(next(KEYS), people.begin(next(KEYS)).id, "consent", "agreed").id
     target = people.pictures.capture_target("OD", None, visit, "R-centre")
-    report = CaptureReport(visit=visit, slot="R-centre", verdict=PictureVerdict("good"))
+    report = CaptureReport(visit=visit, slot="R-centre", verdict=StoredVerdict("good"))
     store.save(Capture("a", "OD", people.clock.wall(), True, "00ff", report, {}), FILES, target.write_rows)
     moved = people.pictures.correct_laterality(next(KEYS), "a", "OS", None)
     stored = store.get("a")
@@ -219,7 +219,7 @@ def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path
         visit = people.begin(begin).id
         people.answer(next(KEYS), visit, "consent", "agreed")
         target = people.pictures.capture_target("OD", press, visit, "R-centre")
-        report = CaptureReport(visit=visit, slot="R-centre", verdict=PictureVerdict("good"))
+        report = CaptureReport(visit=visit, slot="R-centre", verdict=StoredVerdict("good"))
         taken = Capture("a", "OD", clock.wall(), True, "00ff", report, {})
         store.save(taken, FILES, target.write_rows, target.request)
     (folder / "store.sqlite").unlink()

@@ -8,10 +8,8 @@ from pathlib import Path
 import jsonschema_rs
 import pytest
 
-from device.light_safety.dose_report import DoseReport
-from device.values import ChannelUse, Report
-from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection, RecordOrigin
-from services.records.capture_report import report_as_json
+from device.values import ONLY_FRAME, ChannelUse, Report
+from services.records.capture import CaptureReport, CaptureVersion, EyeConfirmation, EyeCorrection, RecordOrigin
 from services.research import report_schema
 from services.research.reconstruct_file import FileReport
 
@@ -44,21 +42,22 @@ def test_every_key_of_every_report_has_a_description() -> None:
     """Also those that a command adds for files, and the instrument for a capture."""
     schema = report_schema.report_schema()
     assert list(described(schema)) == []
-    light = DoseReport(limits_unchecked=("photochemical_dose",))
-    made = Report(
-        "none",
+    full = CaptureReport(
+        frames=(ONLY_FRAME,),
         channels=(ChannelUse("green", (0.0, 0.0)),),
         psf_cylinder={"j0_dpt": 0.5},
         refraction_scatter={"chi2": 3.0},
-    )
-    full = CaptureReport(
-        made, light=light, moved=(EyeCorrection("OD", "R-centre"),), confirmed=EyeConfirmation(), device=RecordOrigin()
+        limits_unchecked=("photochemical_dose",),
+        moved=(EyeCorrection("OD", "R-centre"),),
+        confirmed=EyeConfirmation(),
+        device=RecordOrigin(),
+        versions=(CaptureVersion(1, "a"),),
     )
     properties = schema["properties"]
     assert isinstance(properties, dict)
     files = {one.name for one in fields(FileReport)}
-    assert set(properties) == files | {*report_as_json(full), "simulated"}
-    assert schema["required"] == [one.name for one in fields(Report) if one.name not in report_schema.OPTIONAL]
+    assert set(properties) == files | {*full.as_json(), "simulated"}
+    assert schema["required"] == [one.name for one in fields(Report) if one.name in CaptureReport().as_json()]
 
 
 @pytest.mark.parametrize("file", KEPT, ids=lambda path: path.parent.name)

@@ -13,10 +13,9 @@ from services.errors import StoreDamaged
 from services.health.alerts import Alert
 from services.http.problem_responses import problem_body, problem_response
 from services.http.routes.visits import visit_answer
-from services.http.schemas.captures import capture_answer, report_answer
+from services.http.schemas.captures import capture_answer
 from services.http.schemas.status import AlertAnswer
-from services.records.capture import Capture
-from services.records.capture_report import read_report
+from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.protocol import load_protocol
 from services.records.visit import SlotState, Visit
@@ -31,8 +30,13 @@ STORED: dict[str, Any] = {
 }
 
 
+def wire_text(report: dict[str, Any]) -> str:
+    taken_at = datetime(2026, 3, 1, 9, 30, tzinfo=UTC)
+    return capture_answer(Capture("c1", "OD", taken_at, True, "00ff", CaptureReport.read(report), {})).model_dump_json()
+
+
 def on_the_wire(report: dict[str, Any]) -> Any:
-    return json.loads(report_answer(read_report(report)).model_dump_json())
+    return json.loads(wire_text(report))["report"]
 
 
 def test_entries_of_other_releases_are_passed_on() -> None:
@@ -43,8 +47,7 @@ def test_entries_of_other_releases_are_passed_on() -> None:
 
 
 def test_whole_numbers_stay_whole() -> None:
-    text = report_answer(read_report(STORED)).model_dump_json()
-    assert '"dose_24h_j_per_cm2":{"OD":0.25,"OS":0}' in text
+    assert '"dose_24h_j_per_cm2":{"OD":0.25,"OS":0}' in wire_text(STORED)
 
 
 def test_an_entry_of_an_unknown_type_does_not_hide_the_capture() -> None:
@@ -53,8 +56,7 @@ def test_an_entry_of_an_unknown_type_does_not_hide_the_capture() -> None:
 
 
 def test_times_are_iso_8601_with_an_offset() -> None:
-    capture = Capture("c1", "OD", datetime(2026, 3, 1, 9, 30, tzinfo=UTC), True, "00ff", read_report(STORED), {})
-    assert json.loads(capture_answer(capture).model_dump_json())["taken_at"] == "2026-03-01T09:30:00+00:00"
+    assert json.loads(wire_text(STORED))["taken_at"] == "2026-03-01T09:30:00+00:00"
 
 
 def test_values_that_are_not_known_have_no_key() -> None:

@@ -10,7 +10,7 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import SpecError
 from services.errors import IdempotencyKeyConflict, RecordNotFound, VisitFinished
-from services.records.capture import Capture, CaptureReport, PictureVerdict
+from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
 from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
 from services.records.visit_repository import VisitRepository
@@ -37,7 +37,7 @@ def agreed(people: VisitRepository) -> str:
 
 def shoot(store: CaptureStore, people: VisitRepository, visit: str, slot: str, id: str, word: str = "good") -> None:
     target = people.pictures.capture_target("OD", None, visit, slot)
-    report = CaptureReport(visit=target.visit, slot=target.slot, verdict=PictureVerdict(word))
+    report = CaptureReport(visit=target.visit, slot=target.slot, verdict=StoredVerdict(word))
     store.save(Capture(id, "OD", people.clock.wall(), True, "00ff", report, {}), FILES, target.write_rows)
     people.clock.sleep(1)
 

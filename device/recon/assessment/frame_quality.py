@@ -23,9 +23,8 @@ from device.recon.model.kernels import Pixels, Places
 from device.recon.model.preprocessing import Preprocessor
 from device.recon.reconstructor import plane
 from device.recon.solvers.tv import EvidenceWiener
-from device.values import Calibration, Image
+from device.values import Calibration, Image, Verdict
 
-Word = Literal["good", "again"]
 Code = Literal[
     "shot.saturated",
     "shot.dark",
@@ -72,25 +71,6 @@ class FrameFigures:
     wide: float | None = None
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Verdict on a frame for the operator.
-
-    Attributes
-    ----------
-    word
-        Good or again.
-    code
-        Cause; None if good.
-    numbers
-        Known figures, rounded.
-    """
-
-    word: Word
-    code: Code | None
-    numbers: dict[str, Any]
-
-
 def assess(reading: FrameFigures, eye_before: bool = False) -> Verdict:
     """Return the verdict with the first cause that applies; `eye_before`: an eye was visible just before this frame."""
     code = _cause(reading, eye_before)
@@ -103,7 +83,7 @@ def assess_picture(first: Verdict, residual: float | None, coverage: float | Non
     If `tries` has reached `retakes`, any cause becomes `shot.poor` (the word stays "again"). The residual is recorded
     and does not affect the verdict: stray light and worn pixels double it in good pictures.
     """
-    numbers = first.numbers | _rounded({"residual": residual, "lit": coverage})
+    numbers = dict(first.numbers) | _rounded({"residual": residual, "lit": coverage})
     code = first.code
     if code is None and coverage is not None and coverage < MIN_COVERAGE:
         code = "shot.edge"

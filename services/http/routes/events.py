@@ -3,6 +3,7 @@
 from collections.abc import AsyncIterator
 
 from fastapi import APIRouter, Header
+from pydantic_core import to_json
 
 from device.errors import StoreError
 from services.http.media import EventStream
@@ -49,7 +50,7 @@ def sse_text(event: Event, capture: CaptureAnswer | None = None) -> str:
     """
     payload = SERVER_SENT_EVENT.validate_python({"event": event.kind, "data": capture or event.data}).data
     mark = f"id: {event.number}\n" if event.number else ""
-    return f"{mark}event: {event.kind}\ndata: {payload.model_dump_json()}\n\n"
+    return f"{mark}event: {event.kind}\ndata: {to_json(payload).decode()}\n\n"
 
 
 def _readable(store: CaptureStore, id: str) -> CaptureAnswer | None:

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Query
 
 from services.health.clock_request import offer_time
 from services.http.control_lease import ControlLease
-from services.http.schemas.captures import LateralityCorrection, verdict_answer
+from services.http.schemas.captures import LateralityCorrection
 from services.http.schemas.common import IdempotentRequest
 from services.http.schemas.visits import (
     ControlRequest,
@@ -213,7 +213,7 @@ def _slot_answer(slot: SlotState) -> SlotAnswer:
         state=slot.state,
         capture=chosen.capture if chosen else None,
         captures=[one.capture for one in slot.captures],
-        verdict=verdict_answer(chosen.verdict) if chosen else None,
+        verdict=chosen.verdict if chosen else None,
         reason=slot.decision.reason if slot.decision else None,
         tries=len(slot.captures),
     )

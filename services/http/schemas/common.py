@@ -4,7 +4,7 @@ import re
 from datetime import datetime
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, PlainSerializer, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, WithJsonSchema
 
 KEY_PATTERN = "^[0-9a-f]{16}$"
 ID_PATTERN = "^[A-Za-z0-9._-]{1,128}$"
@@ -16,7 +16,6 @@ Timestamp = Annotated[
     PlainSerializer(datetime.isoformat, return_type=str),  # pydantic would write "Z" for "+00:00"
     WithJsonSchema({"type": "string", "format": "date-time"}),
 ]
-Number = int | float  # a stored number keeps its type
 Value = TypeVar("Value")
 OmittedIfNone = Annotated[
     Value | None, Field(exclude_if=lambda value: value is None)
@@ -51,13 +50,6 @@ class ResponseBody(BaseModel):
     """Response body, or a part of one; its fields are the keys on the wire."""
 
     model_config = ConfigDict(frozen=True, from_attributes=True)
-
-
-class StoredPart(ResponseBody):
-    """Part of a response body that was stored; entries that this release does not know are passed on."""
-
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, JsonValue]
 
 
 class FolderName(ResponseBody):

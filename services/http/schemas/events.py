@@ -2,13 +2,16 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, JsonValue, TypeAdapter
+from pydantic import Field, TypeAdapter
+from pydantic.dataclasses import dataclass
 
 from device.recon.assessment.aiming import AimCode
+from device.values import Verdict
 from services.http.schemas.captures import CaptureAnswer
 from services.http.schemas.common import OmittedIfNone, ResponseBody
 from services.http.schemas.problems import ErrorText
 from services.http.schemas.status import AlertAnswer, FindingAnswer
+from services.records.stored_record import CONFIG
 
 
 class Heartbeat(ResponseBody):
@@ -46,13 +49,11 @@ class CaptureProgress(ResponseBody):
     slot: str | None
 
 
-class CaptureVerdict(ResponseBody):
-    """Verdict on the image quality of a capture: word, code of the cause (null if good), and measured figures."""
+@dataclass(frozen=True, kw_only=True, config=CONFIG)
+class CaptureVerdict(Verdict):
+    """Verdict on the image quality of a capture."""
 
     id: str
-    word: str
-    code: str | None
-    numbers: dict[str, JsonValue]
 
 
 class Failure(ErrorText):

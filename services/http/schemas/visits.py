@@ -4,10 +4,10 @@ from typing import Literal
 
 from pydantic import AwareDatetime, Field
 
-from services.http.schemas.captures import VerdictAnswer
 from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName, Timestamp
 from services.http.schemas.problems import ErrorText
 from services.instrument.visit_montage import MontageState
+from services.records.capture import StoredVerdict
 from services.records.visit import OutcomeCode
 
 FieldAnswer = str | int | bool | list[str] | None
@@ -68,7 +68,7 @@ class SlotAnswer(ResponseBody):
     state: Literal["empty", "taken", "not_possible"]
     capture: str | None
     captures: list[str]
-    verdict: VerdictAnswer | None
+    verdict: StoredVerdict | None
     reason: str | None
     tries: int
 
