@@ -1,70 +1,121 @@
-"""One calibration run on the thread that owns the head: open the bench, measure or roll back, close the bench."""
+"""Steps of a guided calibration: a target before the head, its measurement, the next one; or a rollback.
+
+Stand: calibration target in front of the head (cap, screen, point source). Bench: head opened without a calibration.
+"""
 
 import logging
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import cast
 
-from device.calibration.archive import Archive, StoredCalibration
-from device.calibration.procedure.calibration_sequence import CalibrationSequence, CalibrationTarget, Operator
-from device.clock import Clock
-from device.config.head_file import InstrumentSpec
-from device.errors import CalibrationStopped, DiffuscopeError, StoreFull
-from device.head import Bench, Head
+from device.calibration.archive import StoredCalibration
+from device.calibration.procedure.calibration_sequence import (
+    BRACKETS,
+    DARK_FRAMES,
+    FLAT_FRAMES,
+    FLAT_LEVELS,
+    CalibrationSequence,
+    CalibrationTarget,
+    Operator,
+)
+from device.errors import CalibrationStopped, DiffuscopeError, SettingError, StoreFull
+from device.head import Bench, fault_names
+from services.errors import Busy
 from services.instrument.calibration_request import STEPS_FOLDER, CalibrationRequest, calibration_job, write_identity
-from services.instrument.calibration_state import CalibrationState, RollbackRequest, RunRequest
 from services.instrument.camera_tap import CameraTap
-from services.instrument.trial_lens_state import TrialLensOutcome
-from services.instrument.watchdog import BEAT_S, Watchdog
+from services.instrument.guided_run import (
+    GuidedRun,
+    GuidedSession,
+    RunErrors,
+    RunOutcome,
+    RunParts,
+    RunState,
+    run_guided,
+)
+from services.instrument.watchdog import BEAT_S
 
 log = logging.getLogger(__name__)
 
-RETRY_S = 1.0
-TAP_POLL_S = 0.2  # poll interval while no client requests sensor images
+STANDS: tuple[CalibrationTarget, ...] = ("cap", "screen", "point")
+SEARCH_FRAMES = 6  # approximate number of frames of the exposure search
+EXPECTED_FRAMES: Mapping[CalibrationTarget, int] = {
+    "cap": 3 * DARK_FRAMES,
+    "screen": SEARCH_FRAMES + len(FLAT_LEVELS) * FLAT_FRAMES + 2,
+    "point": SEARCH_FRAMES + sum(n for _, n in BRACKETS),
+}
 STORE_FULL_REMEDY = (
     "Free some space, or give the instrument a folder that it may write into, then measure this step again."
+)
+ERRORS = RunErrors[CalibrationTarget](
+    lambda: Busy("nothing is asked for now", "Wait until the page asks for something."),
+    lambda asked, given: Busy(f"this step wants the {asked}, not the {given}", "Read the page again."),
+    lambda: CalibrationStopped("the technician stopped the calibration"),
 )
 
 
 @dataclass(frozen=True)
-class CalibrationOutcome:
-    """Outcome of a run: the calibration put in force, whether this run measured it, and the error that ended the run.
+class RollbackRequest:
+    """Request to put the archived calibration `id` in force again, without a measurement."""
 
-    `failure` is None after success or a stop; `is_unexpected`: it was no DiffuscopeError. `lenses`: readings of a run
-    with trial lenses, None of any other run.
+    id: str
+
+
+RunRequest = CalibrationRequest | RollbackRequest
+Figures = Mapping[str, float]  # of a measured stand
+TargetRun = GuidedRun[CalibrationTarget, Figures, RunRequest]  # a step is a stand
+TargetState = RunState[CalibrationTarget, Figures, RunRequest]
+
+
+class CalibrationSession(GuidedSession[CalibrationTarget, Figures, RunRequest]):
+    """Calibration run; without a `request` (no valid calibration) it waits for `start`.
+
+    `on_end` is called with the outcome after the bench is closed. Finished steps stay on disk for the next run.
     """
 
-    result: StoredCalibration | None = None
-    was_measured: bool = False
-    failure: DiffuscopeError | None = None
-    is_unexpected: bool = False
-    lenses: TrialLensOutcome | None = None
+    def __init__(self, parts: RunParts, request: RunRequest | None, on_end: Callable[[RunOutcome], None]) -> None:
+        run = TargetRun(parts, request, ERRORS)
+
+        def finish(bench: Bench, tap: CameraTap) -> RunOutcome:
+            return CalibrationSteps(run, bench, tap, is_required=request is None).finish()
+
+        super().__init__(run, lambda: run_guided(run, parts.open_bench, finish, on_end, "calibrating"))
+
+    def start(self, request: RunRequest) -> None:
+        """Start the requested measurement or rollback in a run that waits for a request; Busy if one is under way."""
+        self.run.start(request)
+
+    def ready(self, stand: str, fault: str | None = None) -> None:
+        """Confirm that the stand is in place and start its measurement.
+
+        `fault`: name of a fault to inject into a simulated head. Raises Busy if another or no stand is requested,
+        SettingError for a fault that the head cannot simulate.
+        """
+        is_simulated = self.run.parts.spec.camera.backend == "sim"
+        if fault is not None and (not is_simulated or fault not in fault_names()):
+            raise SettingError(f"{fault!r} cannot go wrong on this head", "Leave it out.")
+        self.run.ready(cast(CalibrationTarget, stand), fault)  # another name is not the requested one
 
 
-@dataclass(frozen=True)
-class RunParts:
-    """Parts of a run; `open_bench` opens the head without a calibration, `open_head` with the one in force."""
-
-    spec: InstrumentSpec
-    archive: Archive
-    clock: Clock
-    watchdog: Watchdog
-    open_bench: Callable[[], Bench]
-    open_head: Callable[[], Head]
+def measured_share(now: TargetState) -> float | None:
+    """Return the measured share of the expected frames of the requested stand, 0 to 1; None if it is unknown."""
+    expected = None if now.step is None else EXPECTED_FRAMES.get(now.step)
+    return None if expected is None else min(now.frames / expected, 1.0)
 
 
-class CalibrationRun:
-    """Run of the procedure on an opened bench; the thread `head` alone uses it.
+class CalibrationSteps:
+    """Steps on an opened bench; the thread `head` alone uses them.
 
     `is_required`: the exam cannot own the head, because there is no valid calibration.
     """
 
-    def __init__(self, parts: RunParts, state: CalibrationState, bench: Bench, tap: CameraTap, is_required: bool):
-        self._parts, self._state, self._bench, self._tap = parts, state, bench, tap
+    def __init__(self, run: TargetRun, bench: Bench, tap: CameraTap, is_required: bool) -> None:
+        self._run = run
+        self._bench = bench
+        self._tap = tap
         self._is_required = is_required
         self._stand_requested = False
 
-    def finish(self) -> CalibrationOutcome:
+    def finish(self) -> RunOutcome:
         """Attempt requests until one puts a calibration in force; CalibrationStopped after a stop.
 
         A later attempt resumes after the finished steps. Raises the error of an attempt that requested no stand yet, if
@@ -75,8 +126,8 @@ class CalibrationRun:
             self._stand_requested = False
             try:
                 if isinstance(request, CalibrationRequest):
-                    return CalibrationOutcome(self._measure(request), was_measured=True)
-                return CalibrationOutcome(self._roll_back(request))
+                    return RunOutcome(self._measure(request), was_measured=True)
+                return RunOutcome(self._roll_back(request))
             except CalibrationStopped:
                 raise
             except DiffuscopeError as error:
@@ -85,24 +136,24 @@ class CalibrationRun:
                 self._record_error(StoreFull(f"what was measured cannot be kept: {error}", STORE_FULL_REMEDY))
 
     def _await_request(self) -> RunRequest:
-        while (now := self._state.now).request is None:
-            check_stop(self._state, self._parts.watchdog)
-            self._state.wait(now, BEAT_S)
+        while (now := self._run.now).request is None:
+            self._run.check_stop()
+            self._run.wait(now, BEAT_S)
         return now.request
 
     def _record_error(self, error: DiffuscopeError) -> None:
         log.warning("calibration step failed: %s", error)
         if self._stand_requested:
-            self._state.show_error(error)
+            self._run.show_error(error)
         elif self._is_required:
-            self._state.await_request(error)
+            self._run.await_request(error)
         else:
             raise error  # the exam can own the head again
 
     def _measure(self, request: CalibrationRequest) -> StoredCalibration:
-        parts = self._parts
+        parts = self._run.parts
         bench = self._bench
-        operator = Operator(self._request_stand, log.info, self._state.show_figures)
+        operator = Operator(self._request_stand, log.info, self._run.show_found)
         job = calibration_job(bench, parts.spec, request, log.info)
         work = parts.archive.root / STEPS_FOLDER
         procedure = CalibrationSequence(job, self._tap, operator, parts.clock, work, bench.chips.thermometer)
@@ -111,70 +162,19 @@ class CalibrationRun:
         return kept
 
     def _roll_back(self, request: RollbackRequest) -> StoredCalibration:
-        kept = self._parts.archive.load(request.id)
-        self._parts.archive.activate(request.id)
+        archive = self._run.parts.archive
+        kept = archive.load(request.id)
+        archive.activate(request.id)
         write_identity(self._bench, kept)
         return kept
 
     def _request_stand(self, stand: CalibrationTarget) -> None:
-        """Request a stand and stream sensor images until it is in place; CalibrationStopped after a stop.
+        """Request a stand and wait until it is in place; CalibrationStopped after a stop.
 
         On a simulated head, also place the stand, and inject the requested fault.
         """
         self._bench.place_target(stand)
         self._stand_requested = True
-        self._state.ask(stand)
-        self._stream_until_ready()
-        if (fault := self._state.now.fault) is not None:
+        self._run.ask(stand, self._tap)
+        if (fault := self._run.now.fault) is not None:
             self._bench.inject_fault(fault)
-
-    def _stream_until_ready(self) -> None:
-        exposure_s = self._parts.spec.camera.exposure_s
-        while True:
-            now = self._state.now
-            check_stop(self._state, self._parts.watchdog)
-            if now.state == "measuring":
-                return
-            if not self._tap.wanted:
-                self._state.wait(now, TAP_POLL_S)
-                continue
-            try:
-                exposure_s = self._tap.take_preview(exposure_s)
-            except CalibrationStopped:
-                raise
-            except DiffuscopeError as error:
-                self._state.show_error(error)
-                self._state.wait(self._state.now, RETRY_S)
-
-
-def check_stop(state: CalibrationState, watchdog: Watchdog) -> None:
-    """Send a heartbeat; CalibrationStopped after a stop."""
-    watchdog.beat()
-    if state.now.is_stopping:
-        raise CalibrationStopped("the technician stopped the calibration")
-
-
-def run_calibration(
-    parts: RunParts, state: CalibrationState, is_required: bool, on_end: Callable[[CalibrationOutcome], None]
-) -> None:
-    """Open the bench, run the procedure, close the bench, and call `on_end` with the outcome at every exit."""
-    outcome = CalibrationOutcome(failure=DiffuscopeError("the instrument stopped unexpectedly"), is_unexpected=True)
-
-    def before_frame() -> None:
-        state.count_frame()
-        check_stop(state, parts.watchdog)
-
-    try:
-        with closing(parts.open_bench()) as bench:
-            parts.watchdog.ready()
-            parts.watchdog.status("calibrating")
-            with closing(CameraTap(bench.camera, parts.spec.camera, parts.clock, before_frame)) as tap:
-                state.open_tap(tap)
-                finished = CalibrationRun(parts, state, bench, tap, is_required).finish()
-        outcome = finished
-    except CalibrationStopped:
-        outcome = CalibrationOutcome()
-    except DiffuscopeError as error:  # from opening or closing the bench, or an attempt that the exam can follow
-        outcome = CalibrationOutcome(failure=error)
-    finally:
-        on_end(outcome)

@@ -19,15 +19,14 @@ from device.errors import CalibrationError, DiffuscopeError, HeadMismatch
 from device.head import Bench, Head, open_head, refuse_recording
 from device.light_safety.dose_ledger import MemoryLedger
 from services.errors import Busy
-from services.instrument.calibration_run import CalibrationOutcome, RunParts
-from services.instrument.calibration_session import CalibrationSession
-from services.instrument.calibration_state import RollbackRequest, RunRequest
+from services.instrument.calibration_run import CalibrationSession, RollbackRequest, RunRequest
 from services.instrument.capture import NO_VISIT, LiveRequest, Preview
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.exam_state import WireState
-from services.instrument.trial_lens_session import TrialLensSession
-from services.instrument.trial_lens_state import TrialLensOutcome, TrialLensRequest
+from services.instrument.guided_run import RunOutcome, RunParts
+from services.instrument.trial_lens_measurement import TrialLensOutcome
+from services.instrument.trial_lens_run import TrialLensRequest, TrialLensSession
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
 
@@ -167,7 +166,7 @@ class HeadTransfer:
         event_bus.publish("failed", code=problem.code, message=problem.message, remedy=problem.remedy)
         exam.release_head()
 
-    def _end_session(self, outcome: CalibrationOutcome) -> None:
+    def _end_session(self, outcome: RunOutcome) -> None:
         """Reopen the exam after a calibration run, which stays the owner until then. Called from the thread of the run.
 
         Stop the process instead if the run ended unexpectedly, or failed without a valid calibration.

@@ -9,6 +9,7 @@ which differs from the one in force in nothing else.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from math import isclose
 
 from device.calibration.archive import Archive, Provenance, StoredCalibration
@@ -22,7 +23,7 @@ from device.calibration.trial_lenses import (
 )
 from device.config.head_file import InstrumentSpec
 from device.config.shipped_heads import LIGHT_PATH
-from device.errors import CalibrationRefused, HardwareError
+from device.errors import CalibrationRefused, DiffuscopeError, HardwareError
 from device.head import Head
 from device.light_safety.burst import require_lit
 from device.optics.light_path import load_light_path
@@ -42,6 +43,22 @@ class LensBench:
     vertex_mm: float = VERTEX_MM
     eye: PowerVector = EMMETROPIC
     lenses: tuple[TrialLens, ...] = TRIAL_LENSES
+
+
+@dataclass(frozen=True)
+class TrialLensOutcome:
+    """Readings of a finished run; `stored` is the calibration with the offset, now in force.
+
+    `fit` is None if the readings determine nothing, `stored` is None if the head was refused or nothing could be
+    stored; then the calibration in force stays, and `failure` has the reason.
+    """
+
+    bench: LensBench
+    readings: tuple[LensReading, ...]
+    ended_at: datetime
+    fit: TrialLensFit | None = None
+    stored: StoredCalibration | None = None
+    failure: DiffuscopeError | None = None
 
 
 class LensCheck:

@@ -1,75 +1,123 @@
-"""One run with trial lenses on the thread that owns the head: open the head, measure each lens, judge, close."""
+"""Steps of a guided run with trial lenses: measure the refraction with each lens, then judge the head.
+
+For a head with a calibration in force. The lamp is on for single exposures, behind the light guard.
+"""
 
 import logging
 from collections.abc import Callable
-from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from device.calibration.archive import Archive, StoredCalibration
 from device.calibration.trial_lenses import LensReading, TrialLensFit
 from device.errors import CalibrationStopped, DiffuscopeError
 from device.head import Head
 from device.optics.trial_lens import TrialLens
-from services.instrument.calibration_run import CalibrationOutcome, RunParts
+from services.errors import Busy
 from services.instrument.camera_tap import CameraTap
-from services.instrument.trial_lens_measurement import LensBench, LensCheck
-from services.instrument.trial_lens_state import TrialLensOutcome, TrialLensState
-from services.instrument.watchdog import BEAT_S, Watchdog
+from services.instrument.guided_run import (
+    GuidedRun,
+    GuidedSession,
+    RunErrors,
+    RunOutcome,
+    RunParts,
+    RunState,
+    run_guided,
+)
+from services.instrument.trial_lens_measurement import LensBench, LensCheck, TrialLensOutcome
 
 log = logging.getLogger(__name__)
 
 Measure = Callable[[Head, Archive, LensBench], LensCheck]
 
+ERRORS = RunErrors[int](
+    lambda: Busy("no lens is asked for now", "Wait until the page asks for one."),
+    lambda asked, given: Busy(f"lens {(asked or 0) + 1} is asked for, not lens {given + 1}", "Read the page again."),
+    lambda: CalibrationStopped("the technician stopped the check with trial lenses"),
+)
 
-class TrialLensRun:
-    """Run on an opened head; the thread `head` alone uses it."""
 
-    def __init__(self, parts: RunParts, state: TrialLensState, bench: LensBench, check: LensCheck) -> None:
-        self._parts, self._state, self._bench, self._check = parts, state, bench, check
+@dataclass(frozen=True)
+class TrialLensRequest:
+    """Request to measure the head with the lenses of a bench."""
 
-    def finish(self) -> CalibrationOutcome:
+    bench: LensBench
+
+
+LensRun = GuidedRun[int, LensReading, TrialLensRequest]  # a step is the number of a lens in the bench, from 0
+LensState = RunState[int, LensReading, TrialLensRequest]
+
+
+class TrialLensSession(GuidedSession[int, LensReading, TrialLensRequest]):
+    """Run with trial lenses; `measure` makes the measurement on the opened head.
+
+    `on_end` is called with the outcome after the head is closed.
+    """
+
+    def __init__(
+        self,
+        parts: RunParts,
+        request: TrialLensRequest,
+        on_end: Callable[[RunOutcome], None],
+        measure: Measure = LensCheck,
+    ) -> None:
+        self.bench = request.bench
+        run = LensRun(parts, request, ERRORS)
+
+        def finish(head: Head, tap: CameraTap) -> RunOutcome:
+            check = measure(replace(head, camera=tap), parts.archive, request.bench)
+            return TrialLensSteps(run, request.bench, check, tap).finish()
+
+        super().__init__(run, lambda: run_guided(run, parts.open_head, finish, on_end, "measuring trial lenses"))
+
+    def ready(self, lens: int) -> None:
+        """Confirm that the lens of this number is in place, and start its measurement.
+
+        Raises Busy if another or no lens is requested.
+        """
+        self.run.ready(lens)
+
+
+class TrialLensSteps:
+    """Steps on an opened head; the thread `head` alone uses them."""
+
+    def __init__(self, run: LensRun, bench: LensBench, check: LensCheck, tap: CameraTap) -> None:
+        self._run = run
+        self._bench = bench
+        self._check = check
+        self._tap = tap
+
+    def finish(self) -> RunOutcome:
         """Request each lens and measure it, then judge the head; CalibrationStopped after a stop.
 
         Within its limits the calibration with the offset is then in force; else the outcome has the refusal.
         """
         readings = tuple(self._read(number, lens) for number, lens in enumerate(self._bench.lenses))
-        check_stop(self._state, self._parts.watchdog)
+        self._run.check_stop()
         fit = None
         try:
             fit = self._check.fit(readings)
             stored = self._check.keep(fit)
         except DiffuscopeError as error:
-            return self._refused(readings, fit, error)
+            log.warning("trial lenses: the calibration stays as it was: %s", error)
+            return RunOutcome(failure=error, lenses=self._outcome(readings, fit, None, error))
         log.info("trial lenses: offset %+.3f dpt, slope %.3f", fit.offset.m_dpt, fit.slope)
-        return CalibrationOutcome(stored, lenses=self._outcome(readings, fit, stored))
+        return RunOutcome(stored, lenses=self._outcome(readings, fit, stored))
 
     def _read(self, number: int, lens: TrialLens) -> LensReading:
         """Request a lens until its measurement succeeds."""
         self._check.present(lens)
         while True:
-            self._state.ask(number)
-            self._wait_until_ready()
+            self._run.ask(number, self._tap)
             try:
                 reading = self._check.read(lens)
             except CalibrationStopped:
                 raise
             except DiffuscopeError as error:
                 log.warning("measurement with the trial lens %s failed: %s", lens.label, error)
-                self._state.show_error(error)
+                self._run.show_error(error)
             else:
-                self._state.show_reading(reading)
+                self._run.show_found(number, reading)
                 return reading
-
-    def _wait_until_ready(self) -> None:
-        while (now := self._state.now).state != "measuring":
-            check_stop(self._state, self._parts.watchdog)
-            self._state.wait(now, BEAT_S)
-
-    def _refused(
-        self, readings: tuple[LensReading, ...], fit: TrialLensFit | None, failure: DiffuscopeError
-    ) -> CalibrationOutcome:
-        log.warning("trial lenses: the calibration stays as it was: %s", failure)
-        return CalibrationOutcome(failure=failure, lenses=self._outcome(readings, fit, None, failure))
 
     def _outcome(
         self,
@@ -78,41 +126,4 @@ class TrialLensRun:
         stored: StoredCalibration | None,
         failure: DiffuscopeError | None = None,
     ) -> TrialLensOutcome:
-        return TrialLensOutcome(self._bench, readings, self._parts.clock.wall(), fit, stored, failure)
-
-
-def check_stop(state: TrialLensState, watchdog: Watchdog) -> None:
-    """Send a heartbeat; CalibrationStopped after a stop."""
-    watchdog.beat()
-    if state.now.is_stopping:
-        raise CalibrationStopped("the technician stopped the check with trial lenses")
-
-
-def run_trial_lenses(
-    parts: RunParts,
-    state: TrialLensState,
-    bench: LensBench,
-    measure: Measure,
-    on_end: Callable[[CalibrationOutcome], None],
-) -> None:
-    """Open the head, measure it with each lens, close it, and call `on_end` with the outcome at every exit."""
-    outcome = CalibrationOutcome(failure=DiffuscopeError("the instrument stopped unexpectedly"), is_unexpected=True)
-    try:
-        with closing(parts.open_head()) as head:
-            parts.watchdog.ready()
-            parts.watchdog.status("measuring trial lenses")
-            with closing(_stoppable(head, parts, state)) as tap:
-                check = measure(replace(head, camera=tap), parts.archive, bench)
-                finished = TrialLensRun(parts, state, bench, check).finish()
-        outcome = finished
-    except CalibrationStopped:
-        outcome = CalibrationOutcome()
-    except DiffuscopeError as error:  # from opening or closing the head
-        outcome = CalibrationOutcome(failure=error)
-    finally:
-        on_end(outcome)
-
-
-def _stoppable(head: Head, parts: RunParts, state: TrialLensState) -> CameraTap:
-    """Return the camera of the head, which takes no frame after a stop."""
-    return CameraTap(head.camera, parts.spec.camera, parts.clock, lambda: check_stop(state, parts.watchdog))
+        return TrialLensOutcome(self._bench, readings, self._run.parts.clock.wall(), fit, stored, failure)

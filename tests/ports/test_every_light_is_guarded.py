@@ -108,8 +108,7 @@ OPENING = {  # every module outside device/head.py that calls one of them, and i
     "services/workshop/calibration_archive.py": "calibrations use",
     "services/http/server.py": "run",
     "services/instrument/head_arbiter.py": "run",
-    "services/instrument/calibration_run.py": "run",
-    "services/instrument/trial_lens_run.py": "run",
+    "services/instrument/guided_run.py": "run",
 }
 LIT_ENDPOINTS = {"POST /api/captures", "GET /api/preview", "POST /api/calibration/trial-lenses/ready"}
 MAIN = [sys.executable, "-c", "from services.cli import main; main()"]

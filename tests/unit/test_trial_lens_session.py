@@ -24,10 +24,9 @@ from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, ExposureSettings, HeadIdentity, Illumination
 from services.errors import Busy
-from services.instrument.calibration_run import CalibrationOutcome, RunParts
-from services.instrument.trial_lens_measurement import LensBench, LensCheck
-from services.instrument.trial_lens_session import TrialLensSession
-from services.instrument.trial_lens_state import TrialLensOutcome, TrialLensRequest, TrialLensRunState
+from services.instrument.guided_run import RunOutcome, RunParts
+from services.instrument.trial_lens_measurement import LensBench, LensCheck, TrialLensOutcome
+from services.instrument.trial_lens_run import LensState, TrialLensRequest, TrialLensSession
 from services.instrument.watchdog import Watchdog
 from tests.journey.conftest import GateClock, until
 from tests.simulated import small_head_toml, world
@@ -69,7 +68,7 @@ class Run:
         self.archive.add_and_activate(calibration, WHO)
         self.before, self.outcomes, self.checks = (
             self.archive.active_id(),
-            list[CalibrationOutcome](),
+            list[RunOutcome](),
             list[KnownCheck](),
         )
         self.known = {one.lens: one for one in readings(off)}
@@ -93,17 +92,17 @@ class Run:
     def no_bench(self) -> None:
         raise AssertionError("a head without its calibration measures no refraction")
 
-    def end(self, outcome: CalibrationOutcome) -> None:
+    def end(self, outcome: RunOutcome) -> None:
         self.outcomes.append(outcome)
         self.done.set()
 
     @property
-    def now(self) -> TrialLensRunState:
-        return self.session.snapshot()
+    def now(self) -> LensState:
+        return self.session.run.now
 
-    def asked(self, lens: int) -> TrialLensRunState:
+    def asked(self, lens: int) -> LensState:
         """Wait until this lens is asked for; return the state."""
-        until(lambda: (self.now.state, self.now.lens) == ("asking", lens) or self.done.is_set())
+        until(lambda: (self.now.state, self.now.step) == ("asking", lens) or self.done.is_set())
         assert not self.done.is_set(), self.outcomes
         return self.now
 
@@ -116,7 +115,7 @@ class Run:
             self.asked(lens)
             self.session.ready(lens)
 
-    def outcome(self) -> CalibrationOutcome:
+    def outcome(self) -> RunOutcome:
         """Wait for the end; the lamp is dark then."""
         assert self.done.wait(30)
         self.session.join(30)
@@ -155,7 +154,7 @@ def begin(template: tuple[World, Calibration], tmp_path: Path) -> Iterator[Begin
 def test_each_lens_is_asked_for_once_and_the_offset_is_then_in_force(begin: Begin) -> None:
     run = begin()
     for number in range(len(TRIAL_LENSES)):
-        assert [one.lens for one in run.asked(number).readings] == list(TRIAL_LENSES[:number])
+        assert [one.lens for one in run.asked(number).found.values()] == list(TRIAL_LENSES[:number])
         assert run.placed[number:] == [(TRIAL_LENSES[number], 12.0)]
         run.session.ready(number)
     outcome = run.outcome()
@@ -197,7 +196,7 @@ def test_a_failed_measurement_is_reported_and_the_same_lens_is_asked_for_again(b
         run.checks[0].failing.append(error)
         run.session.ready(1)
         until(partial(run.has_asked_again, error))
-        assert (run.now.lens, len(run.now.readings)) == (1, 1)
+        assert (run.now.step, len(run.now.found)) == (1, 1)
     run.session.ready(1)
     assert run.asked(2).error is None
 
@@ -213,7 +212,7 @@ def test_a_lens_is_measured_only_while_it_is_asked_for(begin: Begin) -> None:
     with pytest.raises(Busy, match="no lens is asked for now"):
         run.session.ready(0)
     run.clock.gate.set()
-    assert len(run.asked(1).readings) == 1, "a button that was pressed twice measures once"
+    assert len(run.asked(1).found) == 1, "a button that was pressed twice measures once"
     with pytest.raises(Busy):
         run.session.ready(0)
 
@@ -224,7 +223,7 @@ def test_a_stop_while_a_lens_is_asked_for_changes_nothing(begin: Begin, shown: i
     run.show(*range(shown))
     run.asked(shown)
     run.session.stop()
-    assert run.outcome() == CalibrationOutcome()
+    assert run.outcome() == RunOutcome()
     assert run.archive.active_id() == run.before
 
 
@@ -239,7 +238,7 @@ def test_a_stop_while_the_lamp_is_on_ends_the_run_after_this_frame(begin: Begin)
     assert run.world.illumination is not None
     run.session.stop()
     run.clock.gate.set()
-    assert run.outcome() == CalibrationOutcome(), "the readings of all lenses are there, and are not judged"
+    assert run.outcome() == RunOutcome(), "the readings of all lenses are there, and are not judged"
     assert run.archive.active_id() == run.before
 
 
@@ -250,7 +249,7 @@ def test_a_stop_before_the_lit_frame_leaves_the_lamp_dark(begin: Begin) -> None:
     run.session.ready(0)
     run.session.stop()
     run.world.faults.clear()
-    assert run.outcome() == CalibrationOutcome()
+    assert run.outcome() == RunOutcome()
 
 
 def test_an_archive_that_cannot_be_written_refuses_the_offset(begin: Begin) -> None:
@@ -278,7 +277,7 @@ def test_a_memory_that_does_not_answer_keeps_the_calibration_that_it_names(begin
 
 
 def test_a_head_that_cannot_be_opened_ends_the_run(begin: Begin) -> None:
-    run, ended = begin(), list[CalibrationOutcome]()
+    run, ended = begin(), list[RunOutcome]()
 
     def broken() -> Head:
         raise CameraMissing("the camera does not answer")

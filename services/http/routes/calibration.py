@@ -32,11 +32,10 @@ from services.http.schemas.calibration import (
 )
 from services.http.schemas.problems import ErrorText
 from services.instrument.calibration_request import STEPS_FOLDER, CalibrationRequest
-from services.instrument.calibration_session import STANDS, CalibrationSession, SessionState
+from services.instrument.calibration_run import STANDS, CalibrationSession, TargetState, measured_share
 from services.instrument.head_arbiter import HeadArbiter, HeadOwner
 from services.instrument.trial_lens_measurement import LensBench
-from services.instrument.trial_lens_session import TrialLensSession
-from services.instrument.trial_lens_state import TrialLensRequest
+from services.instrument.trial_lens_run import TrialLensRequest, TrialLensSession
 
 MAX_LISTED = 8  # calibrations in the list of earlier ones
 STEP_FILES: dict[CalibrationTarget, str] = {"cap": "darks.npz", "screen": "flats.npz", "point": "point.npz"}
@@ -155,13 +154,13 @@ def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
     archive = arbiter.context.archive
     owner = arbiter.owner
     problem = owner.problem
-    now = _session_state(owner)
+    now = owner.session.run.now if isinstance(owner.session, CalibrationSession) else None
     kept = _listed(archive)
     return CalibrationAnswer(
-        state=now.state,
-        stand=now.stand,
-        progress=now.progress,
-        error=error_text(now.error or owner.calibration_failure),
+        state=_state_without_run(owner) if now is None else now.state,
+        stand=None if now is None else now.step,
+        progress=None if now is None else measured_share(now),
+        error=error_text((None if now is None else now.error) or owner.calibration_failure),
         needed=error_text(problem if isinstance(problem, CalibrationError | HeadMismatch) else None),
         steps=[_step(stand, now) for stand in STANDS],
         unfinished=[stand for stand, name in STEP_FILES.items() if (archive.root / STEPS_FOLDER / name).is_file()],
@@ -178,16 +177,15 @@ def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
     )
 
 
-def _session_state(owner: HeadOwner) -> SessionState:
-    """Return the state of the calibration run; without one `lenses` during a run with trial lenses, else idle."""
-    if isinstance(owner.session, CalibrationSession):
-        return owner.session.snapshot()
-    return SessionState(owner.idle_state if owner.session is None else "lenses")
+def _state_without_run(owner: HeadOwner) -> str:
+    """Return the calibration state without a calibration run: `lenses` during a run with trial lenses, else idle."""
+    return owner.idle_state if owner.session is None else "lenses"
 
 
-def _step(stand: CalibrationTarget, now: SessionState) -> StepState:
-    found = now.found.get(stand)
-    state: Literal["todo", "now", "done"] = "now" if stand == now.stand else "done" if found else "todo"
+def _step(stand: CalibrationTarget, now: TargetState | None) -> StepState:
+    found = None if now is None else now.found.get(stand)
+    is_now = now is not None and now.step == stand
+    state: Literal["todo", "now", "done"] = "now" if is_now else "done" if found else "todo"
     return StepState(stand=stand, state=state, found=None if found is None else dict(found))
 
 

@@ -9,9 +9,8 @@ from services.http.problem_responses import error_text
 from services.http.schemas.calibration import LensPower, TrialLensAnswer, TrialLensRow
 from services.http.schemas.status import FindingAnswer
 from services.instrument.head_arbiter import HeadOwner
-from services.instrument.trial_lens_measurement import LensBench
-from services.instrument.trial_lens_session import TrialLensSession
-from services.instrument.trial_lens_state import TrialLensOutcome
+from services.instrument.trial_lens_measurement import LensBench, TrialLensOutcome
+from services.instrument.trial_lens_run import TrialLensSession
 
 
 def trial_lens_answer(owner: HeadOwner) -> TrialLensAnswer | None:
@@ -21,14 +20,13 @@ def trial_lens_answer(owner: HeadOwner) -> TrialLensAnswer | None:
     if not isinstance(owner.session, TrialLensSession):
         return None
     bench = owner.session.bench
-    now = owner.session.snapshot()
-    current = now.lens if now.state != "begin" else None
+    now = owner.session.run.now
     return TrialLensAnswer(
         state=now.state,
-        lens=current,
+        lens=now.step,
         vertex_mm=bench.vertex_mm,
         eye_dpt=bench.eye.m_dpt,
-        rows=_rows(bench, now.readings, current),
+        rows=_rows(bench, tuple(now.found.values()), now.step),
         findings=[],
         offset=None,
         error=error_text(now.error),
