@@ -4,7 +4,6 @@
 the program uses, and compares everything that they show with the undamaged store.
 """
 
-import json
 import random
 import shutil
 import sqlite3
@@ -21,7 +20,6 @@ from device.calibration.archive import Archive
 from device.clock import VirtualClock
 from device.errors import CalibrationDamaged, CalibrationMissing, DiffuscopeError
 from services.backup.backup_key import KEY_FILE, key_for_recipients, read_key, write_key
-from services.delivery.visit_json import visit_as_json
 from services.errors import BackupDamaged, LoginRequired, RecordNotFound, StoreDamaged
 from services.http.authentication import PinAuthenticator
 from services.records.capture import Capture, CaptureReport, StoredVerdict
@@ -32,6 +30,7 @@ from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue, UploadReceipt
+from services.records.visit_document import visit_document
 from services.records.visit_repository import VisitRepository
 from tests.unit.test_archive import WHO, calibration
 
@@ -120,7 +119,7 @@ def shown(folder: Path, with_settings: bool = False) -> tuple[Shown, int]:
                     files[id, name] = store.read(id, name)
                 except (StoreDamaged, RecordNotFound):
                     reported += 1
-        visits = {one.id: json.dumps(visit_as_json(one), sort_keys=True) for one in people.visits(1000)}
+        visits = {one.id: visit_document(one).model_dump_json() for one in people.visits(1000)}
         doses = {eye: light.spent_j_per_cm2(eye) for eye in ("OD", "OS")}
         settings = dict[str, str]()
         if with_settings:

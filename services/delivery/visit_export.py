@@ -10,7 +10,6 @@ import zipfile
 from collections.abc import Mapping
 from datetime import datetime
 
-from services.delivery.visit_json import visit_as_json
 from services.imaging.picture_files import with_note
 from services.records.answers import IDENTIFIERS
 from services.records.capture import COLOUR, RecordOrigin
@@ -18,6 +17,7 @@ from services.records.capture_store import CaptureStore
 from services.records.device_identity import read_device
 from services.records.json_values import JsonObject
 from services.records.visit import Visit
+from services.records.visit_document import visit_document
 
 EARLIEST_ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # earliest date of a ZIP entry
 
@@ -30,13 +30,12 @@ def export_files(store: CaptureStore, visit: Visit, undo_until: datetime | None)
     fields, with the origin of its newest picture in `device`; `SHA256SUMS`. StoreDamaged if any picture or report is
     damaged.
     """
-    until = undo_until.isoformat() if undo_until else None
-    return _files(store, visit, visit_as_json(visit) | {"undo_until": until})
+    return _files(store, visit, visit_document(visit, undo_until).model_dump(mode="json"))
 
 
 def uploaded_files(store: CaptureStore, visit: Visit) -> dict[str, bytes]:
     """Return the uploaded files of a visit: those of the export, without the time of undo, which changes by the day."""
-    return _files(store, visit, visit_as_json(visit))
+    return _files(store, visit, visit_document(visit).model_dump(mode="json", exclude={"undo_until"}))
 
 
 def _files(store: CaptureStore, visit: Visit, shown: JsonObject) -> dict[str, bytes]:

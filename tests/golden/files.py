@@ -28,7 +28,6 @@ from device.clock import VirtualClock
 from device.config.head_file import load_head
 from services.delivery.uploader import load_settings
 from services.delivery.visit_export import export_files, folder_name, zip_archive
-from services.delivery.visit_json import visit_as_json
 from services.errors import PinWrong, ReceiverUnreachable
 from services.http.authentication import PinAuthenticator
 from services.instrument.accuracy_explorer import AccuracyExplorer
@@ -37,7 +36,7 @@ from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.upload_queue import UploadQueue, UploadReceipt
-from services.records.visit import Visit
+from services.records.visit_document import visit_document
 from services.records.visit_repository import VisitRepository
 from services.research.frontier import measure_scene
 from services.update.ipc import STATE_FILE, StoredError, read_state, write_state
@@ -203,17 +202,13 @@ def _read_store(store: CaptureStore) -> dict[str, Any]:
 
 def _read_visits(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
     people = VisitRepository(store.engine, load_protocol(), clock)
-    visits = [_shown(one, people.undo_until(one)) for one in people.visits(50)]
+    visits = [visit_document(one, people.undo_until(one)).model_dump(mode="json") for one in people.visits(50)]
     exports = {}
     for one in people.visits(50):
         name = folder_name(one)
         content = zip_archive(name, export_files(store, one, people.undo_until(one)), one.begun_at)
         exports[one.number] = hashlib.sha256(content).hexdigest()
     return {"visits": visits, "counts": people.counts(), "damaged": people.damaged(), "exports": exports}
-
-
-def _shown(visit: Visit, undo_until: datetime | None) -> dict[str, Any]:
-    return visit_as_json(visit) | {"undo_until": undo_until and undo_until.isoformat()}
 
 
 def _read_uploads(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:

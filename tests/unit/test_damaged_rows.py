@@ -14,7 +14,6 @@ import pytest
 
 from device.clock import VirtualClock
 from device.errors import DiffuscopeError
-from services.delivery.visit_json import visit_as_json
 from services.errors import RecordNotFound, StoreDamaged
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal
@@ -23,6 +22,7 @@ from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue
+from services.records.visit_document import visit_document
 from services.records.visit_repository import VisitRepository
 
 FILES = dict.fromkeys(sorted(REQUIRED_FILES), b"content")
@@ -140,7 +140,7 @@ def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
         assert store.damaged() <= 1, change_made  # a row whose id changed stays, and its capture is adopted again
         assert len(visits) + people.damaged() == 3, change_made
     written = (
-        [visit_as_json(visit) for visit in visits],
+        [visit_document(visit).model_dump(mode="json") for visit in visits],
         [capture.report.as_json() for capture in captures],
     )
     json.dumps(written, allow_nan=False, ensure_ascii=False).encode()

@@ -15,17 +15,15 @@ from services.http.schemas.visits import (
     LeaseAnswer,
     MissingPicture,
     NewVisit,
-    OutcomeAnswer,
-    SlotAnswer,
     SlotChoice,
-    VisitAnswer,
     VisitCounts,
     VisitList,
 )
 from services.instrument.pending_captures import PendingCaptures
 from services.records.protocol import Protocol
 from services.records.row_validation import reading_record, without_damaged
-from services.records.visit import SlotState, Visit
+from services.records.visit import Visit
+from services.records.visit_document import VisitDocument, visit_document
 from services.records.visit_repository import VisitRepository
 
 
@@ -69,7 +67,7 @@ def _read_router(repository: VisitRepository) -> APIRouter:
         return VisitList(visits=found, counts=VisitCounts.model_validate(repository.counts(on)))
 
     @router.get("/api/visits/{id}")
-    def visit(id: str) -> VisitAnswer:
+    def visit(id: str) -> VisitDocument:
         """Return one visit; 404 for an unknown id, 500 if the stored visit is damaged."""
         return visit_answer(repository.get(id), repository)
 
@@ -81,7 +79,7 @@ def _form_router(repository: VisitRepository) -> APIRouter:
     router = APIRouter()
 
     @router.post("/api/visits", status_code=201)
-    def begin(order: NewVisit) -> VisitAnswer:
+    def begin(order: NewVisit) -> VisitDocument:
         """Begin a visit; without a number, of a new patient with the next automatic number.
 
         Answers 201 with the visit; 422 for an invalid number, or an automatic number with a wrong check digit.
@@ -89,7 +87,7 @@ def _form_router(repository: VisitRepository) -> APIRouter:
         return visit_answer(repository.begin(order.key, order.number), repository)
 
     @router.patch("/api/visits/{id}")
-    def answer(id: str, order: FieldValue) -> VisitAnswer:
+    def answer(id: str, order: FieldValue) -> VisitDocument:
         """Set or clear one form field of a visit.
 
         404 for an unknown visit, 409 for a finished one, 422 for an unknown field or an invalid value.
@@ -104,7 +102,7 @@ def _slot_router(repository: VisitRepository) -> APIRouter:
     router = APIRouter()
 
     @router.post("/api/visits/{id}/not-possible")
-    def record_missing_picture(id: str, order: MissingPicture) -> VisitAnswer:
+    def record_missing_picture(id: str, order: MissingPicture) -> VisitDocument:
         """Record that a picture could not be taken.
 
         404 for an unknown visit or slot, 409 for a finished visit, 422 for an unknown reason.
@@ -112,7 +110,7 @@ def _slot_router(repository: VisitRepository) -> APIRouter:
         return visit_answer(repository.pictures.mark_not_possible(order.key, id, order.slot, order.reason), repository)
 
     @router.post("/api/visits/{id}/slots")
-    def choose(id: str, order: SlotChoice) -> VisitAnswer:
+    def choose(id: str, order: SlotChoice) -> VisitDocument:
         """Fill a picture slot with one of its captures, or empty it.
 
         404 for an unknown visit or slot, or a capture of another slot; 409 for a finished visit.
@@ -120,7 +118,7 @@ def _slot_router(repository: VisitRepository) -> APIRouter:
         return visit_answer(repository.pictures.choose(order.key, id, order.slot, order.capture), repository)
 
     @router.post("/api/captures/{id}/accept")
-    def keep(id: str, order: IdempotentRequest) -> VisitAnswer:
+    def keep(id: str, order: IdempotentRequest) -> VisitDocument:
         """Fill the capture's own slot with this capture; 404 for a test picture, 409 for a finished visit."""
         return visit_answer(repository.pictures.accept_capture(order.key, id), repository)
 
@@ -132,7 +130,7 @@ def _end_router(repository: VisitRepository, pending: PendingCaptures, finished:
     router = APIRouter()
 
     @router.post("/api/visits/{id}/finish")
-    def finish(id: str, order: IdempotentRequest) -> VisitAnswer:
+    def finish(id: str, order: IdempotentRequest) -> VisitDocument:
         """Finish a visit, once no capture of it is pending or after 60 s; a finished visit stays unchanged.
 
         Answers with the visit and its outcome; 404 for an unknown visit.
@@ -143,7 +141,7 @@ def _end_router(repository: VisitRepository, pending: PendingCaptures, finished:
         return visit_answer(visit, repository)
 
     @router.post("/api/visits/{id}/reopen")
-    def reopen(id: str, order: IdempotentRequest) -> VisitAnswer:
+    def reopen(id: str, order: IdempotentRequest) -> VisitDocument:
         """Reopen a finished visit on the day of its finish; 409 on a later day."""
         return visit_answer(repository.reopen(order.key, id), repository)
 
@@ -155,7 +153,7 @@ def _laterality_router(repository: VisitRepository, lease: ControlLease) -> APIR
     router = APIRouter()
 
     @router.post("/api/captures/{id}/eye")
-    def correct_laterality(id: str, order: LateralityCorrection) -> VisitAnswer:
+    def correct_laterality(id: str, order: LateralityCorrection) -> VisitDocument:
         """Correct the laterality of a capture: move it to the slot of `eye` with the same field of view.
 
         If it already belongs to that eye, it stays in place. The report records the correction or confirmation, and the
@@ -185,35 +183,10 @@ def _lease_router(lease: ControlLease) -> APIRouter:
     return router
 
 
-def visit_answer(visit: Visit, repository: VisitRepository) -> VisitAnswer:
+def visit_answer(visit: Visit, repository: VisitRepository) -> VisitDocument:
     """Return a visit with its identifying fields and the time until which its finish can be undone.
 
     StoreDamaged if the stored answer to a form field has another type than any release wrote.
     """
-    ending = visit.outcome
     with reading_record(visit.id):
-        return VisitAnswer(
-            id=visit.id,
-            number=visit.number,
-            begun_at=visit.begun_at,
-            day=visit.day,
-            fields=dict(visit.fields),
-            slots={id: _slot_answer(slot) for id, slot in visit.slots.items()},
-            next_slot=visit.next_slot,
-            no_colour=visit.no_colour,
-            outcome=OutcomeAnswer(code=ending.code, sentence=ending.sentence) if ending else None,
-            finished_at=visit.finished_at,
-            undo_until=repository.undo_until(visit),
-        )
-
-
-def _slot_answer(slot: SlotState) -> SlotAnswer:
-    chosen = slot.chosen
-    return SlotAnswer(
-        state=slot.state,
-        capture=chosen.capture if chosen else None,
-        captures=[one.capture for one in slot.captures],
-        verdict=chosen.verdict if chosen else None,
-        reason=slot.decision.reason if slot.decision else None,
-        tries=len(slot.captures),
-    )
+        return visit_document(visit, repository.undo_until(visit))

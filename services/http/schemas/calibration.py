@@ -5,10 +5,11 @@ from typing import Literal
 from pydantic import Field
 
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
-from services.http.schemas.common import KEY_PATTERN, RequestBody, ResponseBody, Timestamp
+from services.http.schemas.common import KEY_PATTERN, RequestBody, ResponseBody
 from services.http.schemas.problems import ErrorText
 from services.http.schemas.status import FindingAnswer
 from services.instrument.trial_lens_measurement import VERTEX_MM
+from services.records.json_values import Timestamp
 
 
 class CalibrationStart(RequestBody):

@@ -13,9 +13,9 @@ from services.http.schemas.common import (
     OmittedIfNone,
     RequestBody,
     ResponseBody,
-    Timestamp,
 )
 from services.records.capture import COLOUR, Capture, CaptureVersion, ShownReport, StoredVerdict
+from services.records.json_values import Timestamp
 
 
 class NewCapture(RequestBody):

@@ -1,21 +1,15 @@
 """Bases and shared types of all request and response bodies."""
 
 import re
-from datetime import datetime
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
 KEY_PATTERN = "^[0-9a-f]{16}$"
 ID_PATTERN = "^[A-Za-z0-9._-]{1,128}$"
 Key = Annotated[str, Field(pattern=KEY_PATTERN)]
 RecordId = Annotated[str, Field(pattern=ID_PATTERN)]
 SlotName = Annotated[str, Field(min_length=1, max_length=40)]
-Timestamp = Annotated[
-    datetime,
-    PlainSerializer(datetime.isoformat, return_type=str),  # pydantic would write "Z" for "+00:00"
-    WithJsonSchema({"type": "string", "format": "date-time"}),
-]
 Value = TypeVar("Value")
 OmittedIfNone = Annotated[
     Value | None, Field(exclude_if=lambda value: value is None)

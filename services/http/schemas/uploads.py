@@ -1,7 +1,8 @@
 """Bodies of the endpoints of the upload queue."""
 
-from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, Timestamp
+from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody
 from services.http.schemas.problems import ErrorText
+from services.records.json_values import Timestamp
 
 
 class UploadRetry(IdempotentRequest):

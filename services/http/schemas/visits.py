@@ -4,13 +4,11 @@ from typing import Literal
 
 from pydantic import AwareDatetime, Field
 
-from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName, Timestamp
+from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName
 from services.http.schemas.problems import ErrorText
 from services.instrument.visit_montage import MontageState
-from services.records.capture import StoredVerdict
-from services.records.visit import OutcomeCode
-
-FieldAnswer = str | int | bool | list[str] | None
+from services.records.json_values import FormValue
+from services.records.visit_document import VisitDocument
 
 
 class NewVisit(IdempotentRequest):
@@ -23,7 +21,7 @@ class FieldValue(IdempotentRequest):
     """Request body: the value of one form field; null clears it."""
 
     field: str = Field(min_length=1, max_length=40)
-    value: FieldAnswer
+    value: FormValue
 
 
 class MissingPicture(IdempotentRequest):
@@ -59,48 +57,6 @@ class LeaseAnswer(ResponseBody):
     mine: bool
 
 
-class SlotAnswer(ResponseBody):
-    """One picture slot of a visit: the chosen capture with its verdict, all captures, and the number of attempts.
-
-    `reason`: why a picture is not possible, or null.
-    """
-
-    state: Literal["empty", "taken", "not_possible"]
-    capture: str | None
-    captures: list[str]
-    verdict: StoredVerdict | None
-    reason: str | None
-    tries: int
-
-
-class OutcomeAnswer(ResponseBody):
-    """Outcome of a visit: its code, and a sentence for the health worker."""
-
-    code: OutcomeCode
-    sentence: str
-
-
-class VisitAnswer(ResponseBody):
-    """A visit with its form fields and picture slots; `day` is the local date.
-
-    `next_slot`: first empty slot, or null. `outcome`, `finished_at`: null until the visit is finished. `undo_until`:
-    time until which the finish can be undone, or null. `no_colour`: code of the reason why the pictures are shown in
-    green light; null if all are in colour.
-    """
-
-    id: str
-    number: str
-    begun_at: Timestamp
-    day: str
-    fields: dict[str, FieldAnswer]
-    slots: dict[str, SlotAnswer]
-    next_slot: str | None
-    no_colour: str | None
-    outcome: OutcomeAnswer | None
-    finished_at: Timestamp | None
-    undo_until: Timestamp | None
-
-
 class VisitCounts(ResponseBody):
     """Numbers of finished (`done`) and unfinished (`to_finish`) visits; of `done`, those `referred` and `declined`."""
 
@@ -113,7 +69,7 @@ class VisitCounts(ResponseBody):
 class VisitList(ResponseBody):
     """Visits, the newest first, with the counts of the day, or of all days."""
 
-    visits: list[VisitAnswer]
+    visits: list[VisitDocument]
     counts: VisitCounts
 
 
