@@ -1,4 +1,7 @@
-"""`--help` of every command, and exit code and output of good and bad calls, in one process of fixed width."""
+"""Parameters of every command, and exit code and output of good and bad calls, in one process of fixed width.
+
+The words of help and of errors stand in one place, the source: of an error only the number of lines is recorded.
+"""
 
 import io
 import json
@@ -152,7 +155,7 @@ PROGRAMS = (  # of units, of RAUC and of experiments, each in a separate process
 
 
 def record() -> dict[str, Any]:
-    """Return help texts by command and the calls, made by a process with a terminal of 100 columns."""
+    """Return the parameters of each command and the calls, made by a process with a terminal of 100 columns."""
     with TemporaryDirectory() as temporary:
         folder = Path(temporary).resolve()
         command = [sys.executable, "-c", START, str(folder)]
@@ -178,7 +181,7 @@ def _program(words: str, folder: Path) -> dict[str, Any]:
 
 
 def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
-    """Return a value with texts as lists of lines and runs of blanks as two.
+    """Return a value with texts as lists of lines and runs of blanks as two, and of errors their number of lines.
 
     Measured numbers in `out` become placeholders.
     """
@@ -190,6 +193,8 @@ def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
         return value
     if key == "call":
         return normaliser.text(value)
+    if value.lstrip().lower().startswith("usage:"):
+        return "<help>"
     lines = [
         normaliser.text(line.rstrip().replace(version("diffuscope"), "<version>"))
         for line in without_progress(value).splitlines()
@@ -197,14 +202,16 @@ def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
     if key == "out":
         lines = [re.sub(r"(?<![\w.])-?\d+\.\d+(e-?\d+)?(?![\w.])", "<number>", line) for line in lines]
         lines = [re.sub(r"((?:simulated|skipped) +\S+ +)\d+ ", r"\1<ms> ", line) for line in lines]
+    if key == "err":
+        return len([line for line in lines if line])
     return [re.sub(r" {2,}", "  ", line) for line in lines if line]
 
 
-def commands() -> Iterator[list[str]]:
-    """Yield the words of every command and subcommand; the first entry is empty."""
+def commands() -> Iterator[tuple[list[str], Any]]:
+    """Yield the words of every command and subcommand, and the command; the words of the first are empty."""
 
-    def below(command: Any, words: list[str]) -> Iterator[list[str]]:
-        yield words
+    def below(command: Any, words: list[str]) -> Iterator[tuple[list[str], Any]]:
+        yield words, command
         for name, inner in subcommands(command):
             yield from below(inner, [*words, name])
 
@@ -217,6 +224,21 @@ def subcommands(command: Any) -> list[tuple[str, Any]]:
         return []
     context = command.make_context("diffuscope", [], resilient_parsing=True)
     return [(name, command.get_command(context, name)) for name in command.list_commands(context)]
+
+
+def parameters(command: Any) -> list[dict[str, Any]]:
+    """Return the parameters of a command: names, type, limits, default, and whether it is required or repeated."""
+    return [
+        {
+            "names": [*one.opts, *one.secondary_opts],
+            "type": one.type_descriptor.annotation.__name__,
+            "limits": [one.min, one.max],
+            "default": None if one.default is None else str(one.default),
+            "required": one.required,
+            "repeated": one.multiple or one.nargs == -1,
+        }
+        for one in command.params
+    ]
 
 
 def called(words: list[str]) -> dict[str, Any]:
@@ -234,15 +256,20 @@ def called(words: list[str]) -> dict[str, Any]:
 def _made(folder: Path) -> dict[str, Any]:
     """Return the part of the record that one process makes."""
     (folder / "head.toml").write_text(HEAD)
-    helps = {
-        " ".join(["diffuscope", *words]): called([*words, "--help"]) for words in commands() if words not in EXPERIMENTS
+    shown = {
+        " ".join(["diffuscope", *words]): {
+            "parameters": parameters(command),
+            "exit of --help": called([*words, "--help"])["exit"],
+        }
+        for words, command in commands()
+        if words not in EXPERIMENTS
     }
     calls = []
     for call in CALLS:
         kept = [path.name for path in (folder / "a").glob("*") if len(path.name) == 16]
         words = call.format(folder, *(kept or ["none"])).split()
         calls.append({"call": " ".join(["diffuscope", *words])} | called(words))
-    return {"help": helps, "calls": calls}
+    return {"commands": shown, "calls": calls}
 
 
 def print_made() -> None:

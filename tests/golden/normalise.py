@@ -24,6 +24,7 @@ COUNTS = {
     "left_s",
     "spent_s",
 }
+SENTENCES = {"message", "remedy", "sentence"}  # their words stand in one place, the source
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
 MACHINE = {"cpu", "cores", "system"}  # description of the computer in a measured frontier
 OF_THE_LOAD = {"psf_cylinder"}  # parts of a report that only an estimate in time has
@@ -55,6 +56,8 @@ class Normaliser:
         measured = measured or key in MEASURED
         if key in MACHINE and not isinstance(value, Mapping):  # a mapping is a schema of the interface
             return "<of the computer>"
+        if key in SENTENCES and value and isinstance(value, str):
+            return "<sentence>"
         if isinstance(value, str):
             replaced = "<version>" if value == version("diffuscope") else self.text(value)
             return re.sub(r"-?\d+\.\d+", "<number>", replaced) if measured else replaced
