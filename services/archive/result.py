@@ -27,6 +27,7 @@ from device.errors import SettingError
 from device.user_files import files_in
 from services.archive.content import file_digest
 from services.archive.plan import Plan, encoded, read_plan
+from services.records.capture import CaptureReport
 from services.research.reconstruct_file import write_or_raise
 
 COLOUR_PICTURE = "colour.tiff"
@@ -64,14 +65,12 @@ class Stored:
     @property
     def method(self) -> str:
         """Method of the reconstruction."""
-        return str(self._reconstruction.get("method"))
+        return self.reconstruction.method
 
     @property
     def predicted(self) -> tuple[str, ...]:
         """Colours of the picture in colour that were not measured."""
-        channels = self._reconstruction.get("channels")
-        found = channels if isinstance(channels, list) else []
-        return tuple(str(one["name"]) for one in found if isinstance(one, dict) and one.get("predicted") is True)
+        return tuple(one.name for one in self.reconstruction.channels if one.predicted)
 
     @property
     def field_px(self) -> tuple[int, int, int, int]:
@@ -82,9 +81,13 @@ class Stored:
         raise SettingError("a result does not state its field", "Run the plan again with this release.")
 
     @property
-    def _reconstruction(self) -> Mapping[str, object]:
-        report = self.report.get("report")
-        return report if isinstance(report, dict) else {}
+    def reconstruction(self) -> CaptureReport:
+        """Report of the reconstruction; SettingError if it cannot be read."""
+        try:
+            return CaptureReport.read(self.report.get("report"))
+        except ValueError as error:
+            message = f"a result's report cannot be read: {error}"
+            raise SettingError(message, "Delete the result's folder, and run the plan again.") from error
 
 
 class ResultFolder:

@@ -1,7 +1,8 @@
 """Figures of the report that the instrument stored with a capture: the state before a reprocessing run."""
 
-import json
 from pathlib import Path
+
+from services.records.capture import CaptureReport
 
 
 def earlier_figures(path: str) -> dict[str, object]:
@@ -12,19 +13,18 @@ def earlier_figures(path: str) -> dict[str, object]:
     if not path:
         return {}
     try:
-        report = json.loads(Path(path).read_bytes())
+        report = CaptureReport.parse(Path(path).read_text("utf-8"))
     except (OSError, ValueError):
         return {}
-    parts = {key: report.get(key) for key in ("quality", "refraction_dpt", "verdict", "seconds")}
-    quality, dpt, verdict, seconds = (one if isinstance(one, dict) else {} for one in parts.values())
+    verdict = report.verdict
     return {
-        "before_method": report.get("method"),
-        "before_residual": report.get("residual"),
-        "before_cutoff_per_px": quality.get("cutoff_per_px"),
-        "before_structure_sure": quality.get("structure_sure"),
-        "before_sphere_dpt": dpt.get("sphere"),
-        "before_verdict": verdict.get("word"),
-        "before_cause": verdict.get("code"),
-        "dose_j_per_cm2": report.get("dose_j_per_cm2"),
-        "before_seconds": sum(one for one in seconds.values() if isinstance(one, float)) or None,
+        "before_method": report.method,
+        "before_residual": report.residual,
+        "before_cutoff_per_px": report.quality.get("cutoff_per_px"),
+        "before_structure_sure": report.quality.get("structure_sure"),
+        "before_sphere_dpt": (report.refraction_dpt or {}).get("sphere"),
+        "before_verdict": verdict and verdict.word,
+        "before_cause": verdict and verdict.code,
+        "dose_j_per_cm2": report.dose_j_per_cm2,
+        "before_seconds": report.total_s or None,
     }

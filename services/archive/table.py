@@ -9,38 +9,29 @@ from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from io import BytesIO
 from itertools import islice
-from typing import Any
+from types import NoneType
+from typing import get_args, get_type_hints
 
 import pyarrow as pa
 from pyarrow import parquet
 
 from device import atomic_io
+from device.values import Report
 from services.archive.content import digest_of
 from services.archive.plan import Plan, PlannedCapture
 from services.archive.result import COLOUR_PICTURE, PICTURE, TABLE, Quarantined, ResultFolder, Stored
 from services.archive.stored_reports import earlier_figures
+from services.records.capture import CaptureReport
+from services.research.report_schema import QUALITY
 
 ROWS_PER_GROUP = 5_000
-QUALITY = (
-    "saturated",
-    "missing",
-    "mean_dn",
-    "structure_nats",
-    "structure_sure",
-    "through",
-    "coverage",
-    "cutoff_per_px",
-    "resolution_um",
-    "psf_score",
-    "psf_score_sd",
-    "psf_orientation",
-    "psf_mirrored",
-)
 TEXT = pa.string()
 NUMBER = pa.float64()
 COUNT = pa.int64()
 FLAG = pa.bool_()
 TEXTS = pa.list_(pa.string())
+# Entries of a report that are columns of the same name; their types are those of the record.
+ENTRIES = ("method", "bin", "rounds", "stopped", "psf_index", "psf_scale", "noise_dn", "residual")
 BEFORE = {
     "before_picture": TEXT,
     "before_method": TEXT,
@@ -53,6 +44,15 @@ BEFORE = {
     "dose_j_per_cm2": NUMBER,
     "before_seconds": NUMBER,
 }
+
+
+def _column_type(entry: str) -> pa.DataType:
+    """Return the type of the column of a report's entry that is a text or a number, or null."""
+    hint = get_type_hints(Report)[entry]
+    (kind,) = set(get_args(hint) or (hint,)) - {NoneType}
+    return {str: TEXT, int: COUNT, float: NUMBER}[kind]
+
+
 SCHEMA = pa.schema(
     {
         "id": TEXT,
@@ -82,14 +82,7 @@ SCHEMA = pa.schema(
         "channels": TEXTS,
         "predicted_channels": TEXTS,
         "missing_channels": TEXTS,
-        "method": TEXT,
-        "bin": COUNT,
-        "rounds": COUNT,
-        "stopped": TEXT,
-        "psf_index": COUNT,
-        "psf_scale": NUMBER,
-        "noise_dn": NUMBER,
-        "residual": NUMBER,
+        **{name: _column_type(name) for name in ENTRIES},
         **{f"quality_{name}": NUMBER for name in QUALITY},
         "sphere_dpt": NUMBER,
         "sphere_sd_dpt": NUMBER,
@@ -173,11 +166,9 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     """Return the columns of a stored result."""
     document = stored.report
     run = stored.run
-    report, raw, scores = (_object(document.get(key)) for key in ("report", "raw", "scores"))
-    quality = _object(report.get("quality"))
-    dpt = _object(report.get("refraction_dpt"))
-    seconds = _object(run.get("seconds"))
-    same = ("method", "bin", "rounds", "stopped", "psf_index", "psf_scale", "noise_dn", "residual")
+    report = stored.reconstruction
+    raw, scores, seconds = (_object(one) for one in (document.get("raw"), document.get("scores"), run.get("seconds")))
+    dpt = report.refraction_dpt or {}
     place = results.place(name)
     colour = place / COLOUR_PICTURE
     return {
@@ -191,13 +182,13 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
         "exposure_s": raw.get("exposure_s"),
         "light_colour": raw.get("colour"),
         "light_level": raw.get("light_level"),
-        **{key: report.get(key) for key in same},
-        **{f"quality_{key}": quality.get(key) for key in QUALITY},
+        **{name: getattr(report, name) for name in ENTRIES},
+        **{f"quality_{name}": report.quality.get(name) for name in QUALITY},
         "sphere_dpt": dpt.get("sphere"),
         "sphere_sd_dpt": dpt.get("sd"),
         "j0_dpt": dpt.get("j0"),
         "j45_dpt": dpt.get("j45"),
-        "messages": report.get("warnings"),
+        "messages": list(report.warnings),
         **scores,
         "solve_s": seconds.get("solve"),
         "total_s": run.get("total_s"),
@@ -206,23 +197,17 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     }
 
 
-def _frame_columns(report: Mapping[str, object]) -> Row:
+def _frame_columns(report: CaptureReport) -> Row:
     """Return how many frames were taken and used, and the colours that are measured, predicted and missing."""
-    frames = _objects(report.get("frames"))
-    channels = _objects(report.get("channels"))
-    taken = [one for one in channels if one.get("reason") is None]
+    taken = [one for one in report.channels if one.reason is None]
     return {
-        "frames": len(frames),
-        "frames_used": sum(one.get("used") is True for one in frames),
-        "channels": [one.get("name") for one in taken if not one.get("predicted")],
-        "predicted_channels": [one.get("name") for one in taken if one.get("predicted")],
-        "missing_channels": [one.get("name") for one in channels if one.get("reason") is not None],
+        "frames": len(report.frames),
+        "frames_used": sum(one.used for one in report.frames),
+        "channels": [one.name for one in taken if not one.predicted],
+        "predicted_channels": [one.name for one in taken if one.predicted],
+        "missing_channels": [one.name for one in report.channels if one.reason is not None],
     }
 
 
-def _object(value: Any) -> Mapping[str, object]:
+def _object(value: object) -> Mapping[str, object]:
     return value if isinstance(value, dict) else {}
-
-
-def _objects(value: Any) -> list[Mapping[str, object]]:
-    return [_object(one) for one in value] if isinstance(value, list | tuple) else []
