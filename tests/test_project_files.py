@@ -23,7 +23,8 @@ import typer
 import device.errors
 import services.errors
 from device.config.head_file import load_head
-from device.drivers.pi_camera import FRAME_TIMEOUT_S, OPEN_TIMEOUT_S
+from device.drivers.exposure_retry import FRAME_TIMEOUT_S
+from device.drivers.pi_camera import OPEN_TIMEOUT_S
 from services.cli import app
 from services.health import clock_request
 from services.http.connection_limits import ConnectionLimits

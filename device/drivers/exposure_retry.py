@@ -13,6 +13,8 @@ from device.values import Counts, ExposureSettings, Frame, Illumination
 
 log = logging.getLogger(__name__)
 
+FRAME_TIMEOUT_S = 2.0  # of a frame, after its exposure
+FIRST_FRAME = 5  # factor of the timeout for the check frame of the first opening: then the computer starts, too
 CABLE_REMEDY = "Check the camera's cable, then turn the device off and on."
 
 
@@ -28,12 +30,13 @@ class RetryingCamera(ABC):
     """Camera base class; a driver implements `_open`, `_take` (one frame) and `_close_device`.
 
     `_take` raises TimeoutError when no frame arrives; all three raise HardwareError for known faults. `light` is the
-    source of each frame's illumination.
+    source of each frame's illumination; `patience_s` is the timeout for a frame after its exposure.
     """
 
-    def __init__(self, spec: CameraSpec, light: LampState, simulated: bool) -> None:
+    def __init__(self, spec: CameraSpec, light: LampState, simulated: bool, patience_s: float) -> None:
         self._spec, self._light, self._simulated = spec, light, simulated
         self._name = spec.sensor or spec.device
+        self._patience_s = patience_s
         self._number = 0
         self._closed = False
         self._opened = False
@@ -94,6 +97,11 @@ class RetryingCamera(ABC):
         except BaseException:
             self._release()
             raise
+
+    def _timeout_s(self, shot: ExposureSettings, counts: Counts | None) -> float:
+        """Return the timeout in s for a frame; longer for the check frame (`counts` is None) of the first opening."""
+        is_first = counts is None and self._number == 0
+        return shot.exposure_s + self._patience_s * (FIRST_FRAME if is_first else 1)
 
     def _retry_once(self, shot: ExposureSettings, counts: Counts, before: Illumination | None) -> None:
         """Reopen the camera and take the frame into `counts`; CameraStalled if none arrives or the light changed."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.config.head_file import CameraSpec
-from device.drivers.exposure_retry import CABLE_REMEDY, LampState, RetryingCamera
+from device.drivers.exposure_retry import CABLE_REMEDY, FRAME_TIMEOUT_S, LampState, RetryingCamera
 from device.drivers.raw_counts import RawLayout, black_dn, pi_layout
 from device.errors import CameraMismatch, CameraMissing, CameraStalled, HardwareError
 from device.values import Counts, ExposureSettings
@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 
 BUFFERS = 3
 MAX_SETTLING_FRAMES = 16  # frames until a new exposure time is in effect: queued ones plus four of delay, times two
-FRAME_TIMEOUT_S = 2.0
 OPEN_TIMEOUT_S = 10.0
 SPARE_US = 1500  # between two exposures, for the blanking of the read-out; the sensor lengthens it as needed
 MAIN = (320, 240)  # the processed stream that picamera2 requires; not used
@@ -59,8 +58,8 @@ class PiCamera(RetryingCamera):
                 "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them: make pi.",
             ) from error
         self._library, self._mapped = Picamera2, MappedArray
-        super().__init__(spec, light, simulated)
-        self._patience_s, self._allocator = patience_s, allocator
+        super().__init__(spec, light, simulated, patience_s)
+        self._allocator = allocator
         self._device: Any = None
         self._layout: RawLayout
         self._gain = 1.0  # lowest of the sensor, at least 1: an IMX708 begins at 1.123
@@ -169,7 +168,7 @@ class PiCamera(RetryingCamera):
         """
         self._device.set_controls(exposure_controls(shot.exposure_s))
         flush: bool | None = True  # a frame that began before this call may show another illumination
-        wait_s = shot.exposure_s + self._patience_s
+        wait_s = self._timeout_s(shot, counts)
         for _ in range(MAX_SETTLING_FRAMES):
             request = self._device.capture_request(wait=wait_s, flush=flush)
             try:

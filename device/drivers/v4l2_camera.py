@@ -13,7 +13,7 @@ import numpy as np
 from device.clock import Clock
 from device.config.head_file import CameraSpec
 from device.drivers import v4l2
-from device.drivers.exposure_retry import LampState, RetryingCamera
+from device.drivers.exposure_retry import FRAME_TIMEOUT_S, LampState, RetryingCamera
 from device.drivers.raw_counts import V4L2_BITS, RawLayout, v4l2_layout
 from device.errors import CameraMismatch, CameraMissing, CameraStalled, HardwareError
 from device.values import Counts, ExposureSettings
@@ -21,7 +21,6 @@ from device.values import Counts, ExposureSettings
 BUFFERS = 4
 DELAY = 2  # frames after a change of exposure time that may still have the previous one
 MAX_FRAMES = 16
-FRAME_TIMEOUT_S = 2.0
 NO_CAMERA_REMEDY = "Plug the camera in, or name another device in the head's file; see `ls /dev/video*`."
 
 
@@ -43,9 +42,8 @@ class V4l2Camera(RetryingCamera):
         patience_s: float = FRAME_TIMEOUT_S,
         transport: v4l2.Transport | None = None,
     ) -> None:
-        super().__init__(spec, light, simulated)
+        super().__init__(spec, light, simulated, patience_s)
         self._clock = clock
-        self._patience_s = patience_s
         self._kernel = transport or v4l2.KernelTransport()
         self._fd: int | None = None
         self._memory: list[Any] = []
@@ -124,7 +122,7 @@ class V4l2Camera(RetryingCamera):
         try:
             late = DELAY if self._set_exposure(shot) else 0
             for _ in range(MAX_FRAMES):
-                if not self._kernel.wait(self._handle, shot.exposure_s + self._patience_s):
+                if not self._kernel.wait(self._handle, self._timeout_s(shot, counts)):
                     raise TimeoutError
                 buffer = self._buffer(0)
                 self._ioctl(v4l2.DQBUF, buffer)

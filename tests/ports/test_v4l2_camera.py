@@ -50,6 +50,19 @@ def test_an_absent_camera_raises_camera_missing(world):
     assert "Plug the camera in" in missing.value.remedy
 
 
+def test_the_first_frame_of_a_camera_may_take_five_times_as_long(world):
+    """While the camera is opened for the first time, the computer starts, too; a frame in the light has to come."""
+    video, timeouts = EmulatedVideo(world, "Y10 "), list[float]()
+    wait = video.wait
+    video.wait = lambda handle, timeout_s: timeouts.append(timeout_s) or wait(handle, timeout_s)
+    camera = camera_over(video)
+    assert set(timeouts) == {0.1 + 5 * PATIENCE_S}
+    timeouts.clear()
+    camera.expose(ExposureSettings(0.1))
+    assert set(timeouts) == {0.1 + PATIENCE_S}
+    camera.close()
+
+
 def test_an_unplugged_camera_raises_camera_missing(world):
     camera = camera_over(EmulatedVideo(world, "Y10 "))
     world.faults.add("camera.missing")
