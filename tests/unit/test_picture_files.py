@@ -244,7 +244,7 @@ def test_metadata_of_another_type_are_unknown(illumination: object) -> None:
         "eye": "left",
         "taken_at": "yesterday",
         "exposure_s": "0.1",
-        "glow": illumination,
+        "illumination": illumination,
         "simulated": "true",
         "calibration_id": [],
         "head": {},
