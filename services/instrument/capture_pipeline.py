@@ -260,12 +260,20 @@ class CapturePipeline:
         return CaptureRecord(capture, shot, shown, self._head.spec.name, colour)
 
     def live_picture(self, seen: LiveFrame) -> tuple[bytes, Aim]:
-        """Return the live picture (JPEG) of a frame, and its aiming hint."""
-        counts = seen.frame.counts
+        """Return the live picture (JPEG) of a frame, and its aiming hint.
+
+        Of a frame with too many saturated pixels the raw frame is shown: its hint says that it is too bright.
+        FrameError for a frame of another shape.
+        """
+        counts, simulated = seen.frame.counts, seen.frame.simulated
+        aim = self._feedback.aim(counts, seen.exposed_s)
         deadline = Deadline.after(self._clock, PREVIEW_BUDGET_S)
-        made = self.live(counts, simulated=seen.frame.simulated, deadline=deadline, quick=True)
-        jpeg = picture_files.to_jpeg(crop_to_field(made.picture, self._head), PREVIEW_PX, made.simulated)
-        return jpeg, self._feedback.aim(counts, seen.exposed_s)
+        try:
+            picture = self.live(counts, simulated=simulated, deadline=deadline, quick=True).picture
+        except FrameError:
+            picture = counts.astype(np.float32)
+        jpeg = picture_files.to_jpeg(crop_to_field(picture, self._head), PREVIEW_PX, simulated)
+        return jpeg, aim
 
 
 def _lights_dn_per_s(exposure: Exposure, calibration: Calibration, colours_dark: Counts | None) -> dict[Colour, float]:

@@ -155,6 +155,16 @@ def test_saturation_is_reported_without_a_reconstruction(make_rig: Any) -> None:
     assert events == [("verdict", "shot.saturated")]
 
 
+def test_a_live_picture_that_is_too_bright_is_a_hint_and_no_problem(make_rig: Any) -> None:
+    """The worker moves back and presses: a problem would disable the button, in words for a technician."""
+    rig = make_rig()
+    rig.world.target = calibration_targets.screen(rig.world, 1e9)
+    answer = rig.request("GET", "/api/preview")
+    assert answer.status_code == 200
+    assert json.loads(answer.headers["x-aim"])["code"] == "bright"
+    assert rig.request("GET", "/api/status").json()["problem"] is None
+
+
 def test_a_visit_without_possible_pictures_can_be_finished(old_rig: Any) -> None:
     visit = begin(old_rig)
     for slot, reason in zip(SLOTS, ["pupil", "cloudy", "still", "refused"], strict=True):
