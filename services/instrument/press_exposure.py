@@ -178,10 +178,9 @@ class _Exposing:
         taken: dict[Colour, Frame] = {}
         missing: list[ChannelUse] = []
         whole = ExposureSettings(self._head.spec.camera.exposure_s)
-        if colours:
-            self._head.camera.prepare(whole)  # in the dark: a sensor may take some frames to change its exposure
         for colour in colours:
             try:
+                self._head.camera.prepare(whole)  # in the dark: a sensor may take some frames to change its exposure
                 (taken[colour],) = self.lit(self._head.light.hazard.brightest(colour), whole)
             except DiffuscopeError as error:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})

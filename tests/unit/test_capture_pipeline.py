@@ -14,7 +14,7 @@ from device.errors import CameraMissing, CameraStalled, FrameError, LightFault
 from device.head import Head, hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
-from device.recon.assessment.exposure_split import WHOLE
+from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.colour_reconstructor import without_psf
 from device.recon.model.kernels import Pixels
@@ -270,6 +270,32 @@ def test_a_colour_that_fails_leaves_the_lit_frames_and_its_reason(bench: Bench) 
     assert exposure.dose_j_per_cm2 == pytest.approx(spent_j_per_cm2), "the red light was given, too"
     assert exposure.missing == (ChannelUse("red", None, reason="no frame came", code="camera.stalled"),)
     assert exposure.dark.illumination is None
+    assert bench.world.illumination is None
+
+
+class StallsAtLongerExposure:
+    """Camera that gives no frame in the dark when its exposure time is raised from that of a part to a whole one."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._camera, self._whole_s = bench.head.camera, bench.head.spec.camera.exposure_s
+        self.shape = self._camera.shape
+
+    def prepare(self, shot: ExposureSettings) -> None:
+        if shot.exposure_s == self._whole_s:
+            raise CameraStalled("the sensor did not change its exposure")
+
+    def expose(self, shot: ExposureSettings) -> Frame:
+        return self._camera.expose(shot)
+
+
+def test_a_stall_before_the_other_colours_leaves_the_split_frames_and_its_reason(bench: Bench) -> None:
+    head = replace(bench.head, camera=StallsAtLongerExposure(bench))
+    split = ExposureSplit(2, motion_deg=1.0, gain_db=1.0, part_s=head.spec.camera.exposure_s / 2)
+    exposure = expose_press(head, ("OD",), bench.clock, count=2, colours=["red", "blue"], split=split)
+    assert (len(exposure.lit), dict(exposure.colours)) == (4, {})
+    assert [(one.name, one.reason, one.code) for one in exposure.missing] == [
+        (colour, "the sensor did not change its exposure", "camera.stalled") for colour in ("red", "blue")
+    ]
     assert bench.world.illumination is None
 
 
