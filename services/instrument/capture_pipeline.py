@@ -116,13 +116,22 @@ class CapturePipeline:
         taken: Taken = ignore_frame,
         looked: Looked = ignore_look,
     ) -> Exposure:
-        """Return a dark frame, up to `count` lit ones and one in each of `colours`, as `expose_press`.
+        """Return a dark frame, up to `exposures(count)` lit ones and one in each of `colours`, as `expose_press`.
 
         A pipeline of bursts prepares each lit frame while the next one is exposed, and splits the exposures as `split`
         says. `looked` is called in the thread of the preparation, with the quick look of the first useful frame.
         """
         able = [] if self.colours is None else [one for one in colours if one in self.colours.others]
-        run = partial(expose_press, self._head, (eye,), self._clock, in_visit=in_visit, colours=able, field=field)
+        run = partial(
+            expose_press,
+            self._head,
+            (eye,),
+            self._clock,
+            in_visit=in_visit,
+            count=self.exposures(count),
+            colours=able,
+            field=field,
+        )
         if self.bursts is None:
             exposure = run(taken=taken)
         else:
@@ -134,9 +143,13 @@ class CapturePipeline:
                     taken(frame, dose_j_per_cm2, exposed_s)
                     preparation.add(frame)
 
-                exposure = run(count=count, split=split, taken=read_out)
+                exposure = run(split=split, taken=read_out)
                 exposure = replace(exposure, ready=preparation.finish())
         return replace(exposure, missing=(*self._unable(colours), *exposure.missing))
+
+    def exposures(self, count: int) -> int:
+        """Return how many exposures in the picture's colour a press for `count` takes: one without bursts."""
+        return 1 if self.bursts is None else count
 
     def choose_split(self, count: int) -> ExposureSplit:
         """Return the split of the `count` exposures of the next press while the eye moves.

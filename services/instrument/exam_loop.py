@@ -140,7 +140,7 @@ class ExamLoop:
         self._parts.store.refuse_light_in_vain()
         entry = press.journal_entry(id)
         split = self._pipeline.choose_split(target.frames)
-        planned = target.frames * split.parts
+        planned = self._pipeline.exposures(target.frames) * split.parts
         colours = colours_of_lamp(head.spec, target.colours)
         writer = self._parts.capture_journal.begin(entry, press.key, planned, colours)
         shared = RawMetadata(id, press.eye, taken_at, calibration_id=head.calibration.id, head=head.spec.name)

@@ -14,7 +14,7 @@ from PIL import Image
 
 from device.clock import VirtualClock
 from device.config.image_files import as_raw, read_image
-from device.errors import CameraMissing, PsfError, SpecError
+from device.errors import CameraMissing, DiffuscopeError, PsfError, SpecError
 from device.head import Head, open_head, recording_spec
 from device.light_safety.dose_ledger import MemoryLedger
 from device.values import ExposureSettings, Illumination
@@ -22,9 +22,11 @@ from services.imaging.picture_files import raw_tiff, read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
+from services.instrument.resumption import WHOLE
 from services.instrument.watchdog import Watchdog
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
+from services.records.capture_target import CaptureTarget
 from tests import scenes
 from tests.journey.asking import live_picture
 
@@ -104,6 +106,42 @@ def test_one_press_on_a_recording_gives_a_picture_that_is_not_marked(folder: Pat
         assert picture.size == (160, 120)
         pixels = np.asarray(picture).astype(float)
     assert np.corrcoef(pixels.ravel(), spots().ravel())[0, 1] > 0.5
+
+
+class EndsAtVerdict(EventBus):
+    """Event bus that ends the process of an exam after the exposure, when its first verdict is published."""
+
+    def publish(self, kind: str, **facts: Any) -> None:
+        if kind == "verdict":
+            raise ZeroDivisionError("unexpected")
+        super().publish(kind, **facts)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # on purpose
+def test_a_press_on_a_recording_that_is_resumed_with_its_one_frame_is_whole(
+    folder: Path, plans: Path, tmp_path: Path
+) -> None:
+    key = "0" * 16
+    with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
+        exam = ExamService(opened(folder), store, EndsAtVerdict(), VirtualClock(), plans, lambda: None, Watchdog(None))
+        with pytest.raises(DiffuscopeError, match="unexpectedly"):
+            exam.press("OD", key).result(60)
+        exam.close()
+    with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
+        exam = ExamService(
+            opened(folder),
+            store,
+            EventBus(),
+            VirtualClock(),
+            plans,
+            lambda: None,
+            Watchdog(None),
+            resumed_target=lambda one: CaptureTarget(frames=one.planned, colours=one.colours),
+        )
+        capture = exam.press("OD", key).result(60)
+        exam.close()
+    assert WHOLE in capture.report.warnings
+    assert {"raw.tiff", "dark.tiff"} <= set(capture.files)
 
 
 def test_a_recording_of_a_simulated_raw_stays_simulated(folder: Path, play: Played) -> None:
