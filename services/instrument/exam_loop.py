@@ -44,6 +44,8 @@ log = logging.getLogger(__name__)
 LIVE_S = 0.4  # interval of progress events and of live pictures during a refinement
 LOCK_PATIENCE_S = 45.0  # for a locked database; the request that finishes a visit waits longer (pending_captures.py)
 REFUSALS = (StoreFull, StoreLocked, StoreReadOnly, StoreDamaged)  # of the store: what it refuses can be stored later
+AGAIN = "Wait until it is back, then press again."
+UNTIL_BACK = "Wait until it is back."
 POSTPONED = "The frames of this picture are kept: the picture is made at the next start of the instrument."
 
 
@@ -108,12 +110,12 @@ class ExamLoop:
             return False
         return True
 
-    def fail_exposed(self) -> list[Press]:
-        """Forget the captures that wait for their reconstruction; return their presses, for the caller to fail.
+    def take_exposed(self) -> dict[str, Press]:
+        """Forget the captures that wait for their reconstruction; return their presses by id, for the caller to fail.
 
         Their frames stay on the disk, for the next start.
         """
-        presses = [shot.press for shot in self._exposed]
+        presses = {shot.id: shot.press for shot in self._exposed}
         self._exposed.clear()
         return presses
 
@@ -310,12 +312,18 @@ def _end_or_postpone(journal: CaptureJournal, id: str, error: DiffuscopeError) -
 
     The error of a capture that is postponed says so.
     """
-    is_postponed = False
+    if isinstance(error, REFUSALS):
+        return _postponed(journal, id, error)
     with suppress(StoreError):  # then the next start reports the capture as interrupted
-        if isinstance(error, REFUSALS):
-            is_postponed = journal.postpone(id)
-        else:
-            journal.fail(id)
+        journal.fail(id)
+    return error
+
+
+def _postponed(journal: CaptureJournal, id: str, error: DiffuscopeError) -> DiffuscopeError:
+    """Keep the frames of a capture for the next start; return the error, which says so if a lit one is on the disk."""
+    is_postponed = False
+    with suppress(StoreError, OSError):  # then the next start reports the capture as interrupted
+        is_postponed = journal.postpone(id)
     return type(error)(error.message, f"{error.remedy} {POSTPONED}") if is_postponed else error
 
 
@@ -373,9 +381,12 @@ def run_exam(
 
 
 def _fail_waiting(parts: ExamParts, loop: ExamLoop | None) -> None:
-    """Fail the futures of all presses that were not completed, with Busy."""
+    """Fail the futures of all presses that were not completed, with Busy; the frames of exposed ones are kept."""
     pending = parts.requests.end()
-    presses = [*(loop.fail_exposed() if loop is not None else []), *([pending] if pending is not None else [])]
-    presses += [one.press for one in parts.resumed if not one.press.future.done() and one.press not in presses]
-    for press in presses:
-        press.future.set_exception(Busy("the instrument was switched off before the picture was taken"))
+    exposed = {one.id: one.press for one in parts.resumed if not one.press.future.done()}
+    exposed |= loop.take_exposed() if loop is not None else {}
+    for id, press in exposed.items():
+        ended = Busy("the instrument was switched off before the picture was made", UNTIL_BACK)
+        press.future.set_exception(_postponed(parts.capture_journal, id, ended))
+    if pending is not None:
+        pending.future.set_exception(Busy("the instrument was switched off before the picture was taken", AGAIN))

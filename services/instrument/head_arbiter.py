@@ -76,11 +76,14 @@ class HeadOwner:
     @property
     def problem(self) -> DiffuscopeError | None:
         """The error that prevents captures now (Busy while a valid calibration is repeated); None if there is none."""
-        if self.exam is not None:
-            return self.exam.problem
-        if self.calibration_error is not None:
-            return self.calibration_error
-        return Busy("the technician is calibrating the camera", "Wait until the calibration is done.")
+        return self.absence if self.exam is None else self.exam.problem
+
+    @property
+    def absence(self) -> DiffuscopeError:
+        """The reason why the exam does not own the head: no valid calibration, or Busy during a calibration."""
+        return self.calibration_error or Busy(
+            "the technician is calibrating the camera", "Wait until the calibration is done."
+        )
 
     @property
     def state(self) -> WireState:
@@ -160,8 +163,7 @@ class HeadTransfer:
         """Publish that captures are refused, then wait until the exam has released the head."""
         now = self.owner
         event_bus = self._context.event_bus
-        problem = now.problem
-        assert problem is not None
+        problem = now.absence
         event_bus.publish("state", state=now.state)
         event_bus.publish("failed", code=problem.code, message=problem.message, remedy=problem.remedy)
         exam.release_head()
@@ -243,11 +245,11 @@ def _start_waiting(now: HeadOwner, request: RunRequest | TrialLensRequest) -> No
 
 
 def _releasable_exam(now: HeadOwner) -> ExamService:
-    """Return the exam, which can release the head; Busy during a transfer or while it starts, else `problem`."""
+    """Return the exam, which can release the head; Busy during a transfer or while it starts, else `absence`."""
     if now.is_in_transfer:
         raise Busy("a calibration is under way", "Go on with it, or cancel it first.")
     if now.exam is None:
-        raise now.problem or Busy("the instrument is being switched off", "Wait until it is back.")
+        raise now.absence
     if not now.exam.ready.is_set():
         raise Busy("the instrument is still getting ready", "Wait half a minute, then try again.")
     return now.exam
@@ -273,9 +275,9 @@ class HeadArbiter:
 
     @property
     def exam(self) -> ExamService:
-        """The exam; raises `problem` if a calibration run owns the head."""
+        """The exam; raises `HeadOwner.absence` while it does not own the head."""
         if (exam := (owner := self.owner).exam) is None:
-            raise owner.problem or Busy("the instrument is being switched off", "Wait until it is back.")
+            raise owner.absence
         return exam
 
     @property

@@ -14,8 +14,10 @@ import pytest
 from device.errors import DiffuscopeError, StoreFull
 from device.ports import Camera
 from device.values import ExposureSettings, Frame, Illumination
-from services.errors import ConsentDeclined
+from services.errors import Busy, ConsentDeclined
 from services.instrument.capture_pipeline import INTERRUPTED
+from services.instrument.events import EventBus
+from services.instrument.exam_loop import POSTPONED, UNTIL_BACK
 from services.instrument.resumption import CALIBRATION_DARK, NO_DARK, SHORTER, WHOLE
 from services.records import digested_json
 from services.records.capture_journal import MAX_ATTEMPTS
@@ -193,6 +195,36 @@ def test_frames_that_a_full_disk_refuses_wait_for_a_start_with_room(
         kept = rig.exam.press("OD", KEY, before.target).result(60)
         assert set(before.frames) <= set(kept.files)
         assert rig.world.frames == 0, "nothing is exposed again"
+
+
+class EndsAtMaking(EventBus):
+    """Event bus that ends the exam once, when its state is that a capture is exposed and waits to be made."""
+
+    has_ended = False
+
+    def publish(self, kind: str, **data: object) -> None:
+        if kind == "state" and data["state"] == "making" and not self.has_ended:
+            self.has_ended = True
+            raise ZeroDivisionError("unexpected")
+        super().publish(kind, **data)
+
+
+def test_the_error_of_a_press_that_was_exposed_says_that_its_frames_are_kept(
+    build: Callable[..., Rig], tmp_path: Path
+) -> None:
+    """Also that of the next start, if it ends before the frames are reconstructed."""
+    for _ in range(2):
+        with ExitStack() as undo:
+            rig = build(tmp_path, undo, event_bus=EndsAtMaking(), wait=False)
+            with pytest.raises(Busy, match="before the picture was made") as ended:
+                rig.exam.press("OD", KEY).result(60)
+            assert ended.value.remedy == f"{UNTIL_BACK} {POSTPONED}"
+            assert rig.died.wait(10)
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo)
+        made = rig.exam.press("OD", KEY).result(60)
+        assert rig.world.frames == 0, "nothing is exposed again"
+        assert len(made.report.frames) == 4
 
 
 @pytest.mark.timeout(600)
