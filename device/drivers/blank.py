@@ -6,7 +6,7 @@
 
 The chain keeps its last colour while it has power, so a killed process leaves the LEDs on. The guard reads leases from
 standard input: `lit 1.5` (turn off in 1.5 s unless a new lease arrives), `dark` (no lease), `watch 12 13` (threads
-of its parent, whose end is the parent's); it answers each with `ok`, or `old` to a kernel that cannot watch threads.
+of its parent, whose end is the parent's); it answers each with `ok`, or `old` on a kernel that cannot watch threads.
 Without --chip the messages of both kinds are sent: that of the TLC5971 first, which then ignores the other one, as no
 word at a packet's place in it begins with the write command. A matrix of APA102 sees the other message last.
 Exit status 1: the device does not exist, or does not accept the frame.

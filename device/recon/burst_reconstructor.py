@@ -44,8 +44,8 @@ class PreparedFrame:
 class BurstReconstructor:
     """Reconstruction of bursts: their frames are registered, joined and solved as one.
 
-    One burst at a time. Between two of its steps `single` may make quick looks of other frames. Not
-    thread-safe.
+    One burst at a time. Between two of its steps `single` may make quick looks of other frames, and `prepare` may be
+    called. Not thread-safe.
 
     Parameters
     ----------
@@ -304,8 +304,8 @@ class _Run:
 def in_one_exposure(made: Reconstruction, light: float) -> Reconstruction:
     """Return the picture of a sum of frames, and its report, in DN of one exposure.
 
-    The sum has `light` times the light of one exposure.
-    Its noise is that of the average. Weights of the solver (tau, mu) stay those of the sum.
+    The sum has `light` times the light of one exposure; in DN of one exposure the noise is that of the average. Weights
+    of the solver (tau, mu) stay those of the sum.
     """
     report = made.report
     quality = report.quality | {"mean_dn": report.quality["mean_dn"] / light}

@@ -388,7 +388,7 @@ class Reconstructor:
         refraction
             Task of this frame, if it has begun.
         others
-            Other frames of its burst, which join the refraction without a `deadline`.
+            Other frames of its burst, which the refraction takes into account; not with a `deadline`.
 
         Yields
         ------
@@ -479,8 +479,8 @@ class Reconstructor:
     ) -> RefractionTask | None:
         """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
 
-        `task`: that of the frame, if it has begun; `others`: the other frames of its burst. Return the task, None
-        without a refractor or without time.
+        `task`: that of the frame, if it has begun; `others`: the other frames of its burst, which are joined without
+        a deadline only. Return the task, None without a refractor; without time `task` as it is.
         """
         begin_s = self.clock.now_s()
         eye = None

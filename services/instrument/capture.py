@@ -86,7 +86,7 @@ class ExposedCapture:
 
     @property
     def frame(self) -> Frame:
-        """The first lit frame that can be used: the reference of the burst, and the quick look."""
+        """The first good lit frame, without a good one the first: the verdict is on it."""
         return self.exposure.lit[0]
 
 
@@ -146,9 +146,9 @@ def capture_files(
 
     `colour` is the picture in colour, if there is one: `colour.png`, and reduced `quick.jpg`. The picture in green is
     `picture.png`, and reduced `green.jpg`, without colour also `quick.jpg`. `head` is the name of the head. The raw
-    frames and the calibration in their metadata suffice to repeat the reconstruction: `raw.tiff` is the first frame of
-    the burst, `raw-1.tiff` the next one, `raw-red.tiff` that in red light; without a dark frame there is no
-    `dark.tiff`.
+    frames and the calibration in their metadata suffice to repeat the reconstruction: `raw.tiff` is the first good
+    frame of the burst (the first one without a good one), `raw-1.tiff` the next of the others, `raw-red.tiff` that in
+    red light; without a dark frame there is no `dark.tiff`.
     """
     note = f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
     green = picture_files.to_jpeg(shown, THUMBNAIL_PX, capture.simulated)

@@ -307,7 +307,8 @@ def plan_pipeline(
 
     `origin` returns the origin of a capture, None if its device has no identity.
 
-    With PSFs of several depths one frame is exposed, to choose among them. Raises the errors of `expose_press` then.
+    With PSFs of several depths a dark and a lit frame are exposed, to choose among them. Raises the errors of
+    `expose_press` then.
     """
     planner = Planner(plans)
     light = head.spec.light

@@ -35,10 +35,11 @@ from services.records.capture_target import FRAMES, TEST_PICTURE, CaptureTarget
 class ExamService:
     """Exam of one head: one capture for each press, and live pictures while a client requests them.
 
-    Callable from any thread. The thread `head`, started here, owns the head until `close`; requests before `ready` wait
-    until the FFT plans are made. After an error during planning, or after an unexpected exception, `on_failure` is
-    called. `budget_s` returns the time budget of a capture, `plans` is the folder of the FFT plans. `resumed_target`
-    returns the target of a capture that a kill has interrupted, whose frames are reconstructed first (resumption.py).
+    Callable from any thread. The thread `head`, started here, owns the head until `close`; a press before `ready` waits
+    until the FFT plans are made, a request for a live picture 2 s. After an error during planning, a LightFault of the
+    lamp's `off` or an unexpected exception, `on_failure` is called. `budget_s` returns the time budget of a capture,
+    `plans` is the folder of the FFT plans. `resumed_target` returns the target of a capture that a kill has
+    interrupted, whose frames are reconstructed first (resumption.py).
     """
 
     def __init__(
@@ -92,7 +93,8 @@ class ExamService:
     def state(self) -> WireState:
         """The state for the page: `starting` and `making` accept one press more, `aim` accepts one, `busy` none.
 
-        While a press waits for the plans the state stays `starting`, and further presses are refused.
+        While a press waits for the plans the state stays `starting`, and further presses are refused. So are all of
+        them after the end of the exam, when the last state stays.
         """
         return self.snapshot.wire_state
 

@@ -352,7 +352,8 @@ def run_exam(
 ) -> None:
     """Make the plans, call `ready`, then run the loop; at every exit turn the lamp off and fail the waiting presses.
 
-    After a planning error or an unexpected exception also call `on_failure`, which ends the process (restart).
+    After a planning error, a LightFault of the lamp's `off` or an unexpected exception also call `on_failure`, which
+    ends the process (restart).
     """
     failure: DiffuscopeError | None = None
     loop: ExamLoop | None = None

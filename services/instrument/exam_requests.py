@@ -63,9 +63,10 @@ class ExamSnapshot:
 class ExamRequests:
     """Requests of any thread to the exam, and its state. Thread-safe.
 
-    The mutex `_lock` guards every field. It is never held over input or output, a solver round or a callback; `wait`
-    releases it, and `preview` waits without it. The thread `head` alone calls `wait`, `advance`, `take_press`,
-    `live_request`, `withdraw`, `show` and `end`; `show` also that of the preparation, while `head` exposes.
+    The mutex `_lock` guards every field that changes. It is never held over input or output, a solver round or a
+    callback; `wait` releases it, and `preview` waits without it. The thread `head` alone calls `wait`, `advance`,
+    `take_press`, `live_request`, `withdraw`, `show` and `end`; `show` also that of the preparation, while `head`
+    exposes.
     """
 
     def __init__(self, clock: Clock) -> None:

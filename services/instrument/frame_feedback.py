@@ -44,7 +44,8 @@ class FrameAssessor:
     def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
         """Return the verdict on the raw frame of a capture before its reconstruction.
 
-        `dark`: its dark frame; None: the black level of the sensor. `begin_s`: begin of the exposure (clock seconds).
+        `dark`: its dark frame; None: that of the calibration, for the brightness the black level of the sensor.
+        `begin_s`: begin of the exposure (clock seconds).
         FAILED_VERDICT for a frame that cannot be assessed.
         """
         try:

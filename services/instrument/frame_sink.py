@@ -9,7 +9,7 @@ from services.records.frame_writer import DARK, FrameWriter, TakenFrame
 class FrameSink:
     """Receiver of the frames of one press, which it passes to their writer without waiting; head thread only.
 
-    `shared`: metadata of all its frames. `colour`: that of the burst; a frame in another one is of that colour.
+    `shared`: metadata of all its frames. `colour`: that of the burst; a lit frame in another colour is named after it.
     """
 
     def __init__(self, writer: FrameWriter, shared: RawMetadata, colour: Colour) -> None:

@@ -28,9 +28,10 @@ class ProgressEstimate:
 class Progress:
     """Progress estimator: the time left at a stage is the median time from that stage to storage, last RECENT captures.
 
-    Before the first capture, defaults from the duration of all exposures `exposing_s`, the time budget `budget_s`
-    (seconds) and STORAGE_S replace the median. The thread that owns the head calls the methods, `estimate` also that of
-    the preparation, while the former exposes; `late_s` may be read from any thread.
+    Before the first capture, defaults replace the median: from `exposing_s`, the duration of the dark and the lit
+    exposures of a press without other colours, the time budget `budget_s` (both in seconds) and STORAGE_S. The thread
+    that owns the head calls the methods, `estimate` also that of the preparation, while the former exposes; `late_s`
+    may be read from any thread.
     """
 
     def __init__(self, clock: Clock, exposing_s: float, budget_s: Callable[[], float]) -> None:

@@ -1,4 +1,4 @@
-"""Reading and writing of whole files of the store: frames, pictures and reports pass here, records do not."""
+"""Reading and writing of whole files of the store: frames, pictures, reports and records."""
 
 import errno
 import os

@@ -49,8 +49,9 @@ class InterruptedCapture:
 class ResumableCapture:
     """An interrupted capture with at least one lit frame on the disk.
 
-    `press`: its entry; `key`: idempotency key of its request. `planned`: number of lit frames that were to be taken.
-    `colours`: other colours of light that were to be taken. `frames`: what is on the disk, in order of exposure.
+    `press`: its entry; `key`: idempotency key of its request. `planned`: number of frames in the picture's colour that
+    were to be taken, the parts of split exposures counted. `colours`: other colours of light that were to be taken.
+    `frames`: what is on the disk, in order of exposure.
     """
 
     press: InterruptedCapture
@@ -65,8 +66,8 @@ class CaptureJournal:
 
     Entries that exist at the opening belong to interrupted captures; an entry whose capture is in the store is deleted
     instead, with its frames. Those with a lit frame are in `resumable`, until `end` or `fail`, the others in
-    `interrupted`; so are captures that the store quarantined at its opening, without an entry with id and eye only. An
-    entry without a visit is reported in one run only: `mark_reported`. In a read-only store nothing is resumed.
+    `interrupted`. So are captures that the store quarantined at its opening; one without an entry has only id and eye.
+    An entry without a visit is reported in one run only: `mark_reported`. In a read-only store nothing is resumed.
     """
 
     def __init__(self, store: CaptureStore) -> None:

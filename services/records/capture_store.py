@@ -14,6 +14,12 @@
                                   space is needed (quarantine.py)
     snapshots/                    copies of the tables before each migration (snapshots.py)
     journal/                      captures in progress and their frames (capture_journal.py)
+    dose-ledger.log               second copy of the dose ledger (dose_ledger_log.py)
+    exports/<visit>.json          copies on USB drives (export_records.py)
+    device.json                   identity of the device (device_identity.py)
+    reserve.bin                   space for records on a full disk (reserve_file.py)
+    replaced/                     what a restored backup replaced (restoration.py)
+    .lock                         lock of the commands that change the folder
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
 folder that has all files of a capture and no row may have lost its row: the next opening restores the row from the

@@ -23,11 +23,12 @@ def permit_test_picture() -> None:
 class CaptureTarget:
     """Target of a capture: visit id, slot id and field of view; without a visit the capture is a test picture.
 
-    `tries`: number of earlier captures of the slot; `retakes`: permitted number of retakes. `write_rows` adds
-    rows in the transaction that stores the capture, whose record holds `request`, the reference of the press
-    (`IdempotentRequests.reference`). `permit` is called right before the light and raises ConsentMissing
-    or ConsentDeclined if the visit does not allow light. `frames`: number of lit frames, 1 to FRAMES.
-    `colours`: other colours of light, of which one frame each is taken.
+    `tries`: number of earlier captures of the slot; `retakes`: permitted number of retakes. `write_rows` adds rows in
+    the transaction that stores the capture, whose record holds `request`, the reference of the press
+    (`IdempotentRequests.reference`). `permit` is called right before the light and raises ConsentMissing or
+    ConsentDeclined if the visit does not allow light. `frames`: number of exposures in the picture's colour, 1 to
+    FRAMES, each of which may be split into several frames; of a resumed capture the number of these frames. `colours`:
+    other colours of light, of which one frame each is taken.
     """
 
     visit: str | None = None

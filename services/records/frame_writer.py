@@ -1,6 +1,6 @@
 """Frames of a press on the disk from their read-out on, so that a kill of the process loses no frame that was taken.
 
-    journal/<id>/raw.tiff, raw-1.tiff, ..., raw-red.tiff, dark.tiff    frames in the order of exposure
+    journal/<id>/dark.tiff, raw.tiff, raw-1.tiff, ..., raw-red.tiff    frames in the order of exposure
     journal/<id>/<name>.json                                           note of one frame: SHA-256, length, dose
 
 The note is written after its frame: a frame without a note, or with another SHA-256 than in its note, does not count.

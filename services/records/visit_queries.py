@@ -64,10 +64,11 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
 
 
 def find_rows(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
-    """Return the newest `limit` visit rows, newest first, that match all given filters; a row without an id is omitted.
+    """Return the newest `limit` visit rows, newest first, that match all given filters.
 
-    The order is the order of storage (row number), independent of the clock.
-    `day`: date of the visit; `open`: True for unfinished, False for finished; `digits`: part of the patient's number.
+    Of these, rows without an id are omitted: there may be fewer. The order is that of their begin (row number),
+    independent of the clock. `day`: date of the visit; `open`: True for unfinished, False for finished; `digits`: part
+    of the patient's number, also letters.
     """
     query = select(VisitRow).order_by(VISIT_ROWID.desc()).limit(limit)
     if day is not None:
@@ -154,7 +155,7 @@ def damaged(session: Session, protocol: Protocol) -> int:
 
 
 def _checked_row(row: VisitRow) -> VisitRow:
-    """Return the row unchanged; StoreDamaged if its id or its patient number is not valid text."""
+    """Return the row unchanged; StoreDamaged if its id is not that of a visit, or its patient number no text."""
     with reading_record(row.id):
         if not _ID.fullmatch(row_validation.text(row.id)):
             raise ValueError("no name of a visit")
@@ -210,7 +211,7 @@ def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[obj
 
 
 def _taken_capture(capture: object, verdict_json: object, method: object, channels_json: object) -> SlotCapture:
-    """Return a capture of a slot; ValueError for an invalid id.
+    """Return a capture of a slot; ValueError for an id that is no text.
 
     A verdict that is missing or unreadable is None; so is `no_colour` with a report that is.
     """

@@ -39,7 +39,8 @@ def press_router(
         cross-origin request (CSRF), 404 for an unknown visit or slot, 409 while the camera is busy, without consent, in
         a finished visit, for a key of another request or while another screen holds the control lease, 422 for an
         invalid body, 423 without a valid calibration. Failed after it: 409 if the consent was withdrawn, 423 if light,
-        heat or power forbid the exposure, 503 if a part of the head does not answer, 507 if the disk is full.
+        heat or power forbid the exposure, 500 if the store is damaged, 503 if a part of the head does not answer or
+        the store is locked or read-only, 507 if the disk is full.
         """
         key = press.key
         pictures = repository.pictures

@@ -50,12 +50,12 @@ class RefractionTask:
         return self._found.result()
 
     def latest(self) -> Refraction | NoRefraction:
-        """Wait for M; return the newest result so far: joined, with cylinder, or M alone, also if that is refused."""
+        """Wait for the mean sphere M; return the newest result: joined, with cylinder or M alone, or a refusal."""
         futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
         return next((future for future in futures if future.done()), self._found).result()
 
     def best(self) -> Refraction | NoRefraction:
-        """Return the last refraction of those that are known; that without a cylinder if there is no other."""
+        """Wait for the mean sphere M; return the newest refraction so far, NoRefraction if M is refused."""
         futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
         known = (future.result() for future in futures if future.done())
         return next((result for result in known if isinstance(result, Refraction)), self._found.result())
