@@ -1,24 +1,13 @@
 """Shutter button: a GPIO line to ground."""
 
-from typing import Protocol
-
 from device.clock import Clock
-
-
-class Line(Protocol):
-    """GPIO input of the button (device/drivers/gpio.py)."""
-
-    def get(self) -> bool:
-        """Return whether the line is pulled to ground."""
-
-    def close(self) -> None:
-        """Release the line."""
+from device.drivers.gpio import InputLine
 
 
 class GpioButton:
     """Button on a polled line: there are no edge events, so a press that lies between two polls is missed."""
 
-    def __init__(self, line: Line, clock: Clock) -> None:
+    def __init__(self, line: InputLine, clock: Clock) -> None:
         self._line, self._clock = line, clock
         self._since_s: float | None = None
 

@@ -6,26 +6,17 @@ after a kernel hang, a power failure or a stopped process, whatever the LEDs hav
 
 from math import ceil
 from threading import Event, Thread
-from typing import Protocol
+
+from device.drivers.gpio import OutputLine
 
 BEAT_S = 0.1  # a fifth of the gate's hold time, so that a late thread does not interrupt the power
 POWER_UP_S = 0.01  # from an edge until the chain accepts data
 
 
-class Line(Protocol):
-    """GPIO output that the heartbeat drives (device/drivers/gpio.py)."""
-
-    def set(self, high: bool) -> None:
-        """Drive the line high or low."""
-
-    def close(self) -> None:
-        """Release the line."""
-
-
 class Heartbeat:
     """Heartbeat in a thread: toggles a line every 0.1 s from `start` to `stop`, and never for longer than the lease."""
 
-    def __init__(self, line: Line) -> None:
+    def __init__(self, line: OutputLine) -> None:
         self._line = line
         self._high = False
         self._stopped = Event()
