@@ -11,10 +11,6 @@ from device.values import EYES, ExposureSettings, Eye, Frame, Illumination
 ROUNDING_S = 1e-6  # of sums of durations
 
 
-def ignore_frame(_: Frame) -> None:
-    """Do nothing with a frame that was taken."""
-
-
 def burst(
     camera: Camera,
     light: GuardedLight,
@@ -27,7 +23,7 @@ def burst(
     in_visit: bool = False,
     parts: int = 1,
     whole_s: float | None = None,
-    taken: Callable[[Frame], None] = ignore_frame,
+    taken: Callable[[Frame], None] = lambda _: None,
 ) -> tuple[Frame, ...]:
     """Return up to `count` frames in one illumination, which stays on from the first to the last of them.
 

@@ -84,7 +84,7 @@ def create_app(
     pack = archive_builder(store, visits)
     worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
     alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue)
-    checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.state == "aim", clock)
+    checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.owner.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
     app = _http_application(life, own_host_names() if host_names is None else host_names)

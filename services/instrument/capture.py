@@ -116,17 +116,15 @@ class IdempotencyKeys:
             raise key_conflict()
         return press.future
 
-    def remember(self, key: str, press: Press) -> None:
-        """Store a press under its key, in place of the one whose key was not used for longest beyond REMEMBERED."""
-        self._presses.put(key, press)
+    def remember(self, press: Press) -> None:
+        """Store a press that has a key, in place of the one whose key was not used for longest beyond REMEMBERED."""
+        if press.key is not None:
+            self._presses.put(press.key, press)
 
 
 def frame_metadata(capture: RawMetadata, frame: Frame) -> RawMetadata:
     """Return the metadata of a raw frame; `capture`: those of all frames of its capture."""
-    exposure_s = frame.exposure_s
-    light = frame.illumination
-    simulated = frame.simulated
-    return replace(capture, exposure_s=exposure_s, illumination=light, simulated=simulated)
+    return replace(capture, exposure_s=frame.exposure_s, illumination=frame.illumination, simulated=frame.simulated)
 
 
 def lit_name(index: int) -> str:

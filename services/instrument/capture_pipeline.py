@@ -7,7 +7,7 @@ thread of the preparation.
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -41,8 +41,8 @@ from device.values import (
 from services.imaging import picture_files
 from services.instrument.capture import FRAME_QUALITY, ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
-from services.instrument.frame_preparation import FramePreparation, Looked, ignore_look
-from services.instrument.press_exposure import Exposure, LiveFrame, Taken, expose_press, ignore_frame
+from services.instrument.frame_preparation import FramePreparation, Looked
+from services.instrument.press_exposure import Exposure, LiveFrame, Taken, expose_press
 from services.records.blobs import FileContent
 from services.records.capture import NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import OTHER_COLOURS
@@ -52,27 +52,6 @@ log = logging.getLogger(__name__)
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
 INTERRUPTED = "the instrument stopped before this frame was on the disk"
-
-
-@dataclass(frozen=True)
-class CaptureRecord:
-    """Capture before its storage: its row, its exposure, and the picture of the illuminated field; `head`: its name.
-
-    `colour` is the picture in colour, if there is one.
-    """
-
-    capture: Capture
-    shot: ExposedCapture
-    shown: Image
-    head: str
-    colour: Image | None = None
-
-    def files(self) -> dict[str, FileContent]:
-        """Return the files by name.
-
-        Waits until the frames of the press are on the disk, or have failed to be.
-        """
-        return capture_files(self.capture, self.head, self.shot, self.shown, self.colour)
 
 
 class CapturePipeline:
@@ -113,8 +92,8 @@ class CapturePipeline:
         split: ExposureSplit = WHOLE,
         colours: Sequence[Colour] = (),
         field: str | None = None,
-        taken: Taken = ignore_frame,
-        looked: Looked = ignore_look,
+        taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
+        looked: Looked = lambda picture, simulated: None,
     ) -> Exposure:
         """Return a dark frame, up to `exposures(count)` lit ones and one in each of `colours`, as `expose_press`.
 
@@ -262,15 +241,20 @@ class CapturePipeline:
         """Return the final verdict, from the first one, the report and the number of tries of the slot."""
         return self._feedback.reassess(shot.verdict, report, shot.press.target)
 
-    def record(self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, budget_s: float) -> CaptureRecord:
-        """Return the record of a capture with its report, laterality estimate and shown picture."""
+    def record(
+        self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, budget_s: float
+    ) -> tuple[Capture, Callable[[], dict[str, FileContent]]]:
+        """Return a capture with its report and laterality estimate, and a function that returns its files by name.
+
+        That function waits until the frames of the press are on the disk, or have failed to be.
+        """
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
         report = replace(capture_report(shot, made.report, verdict, side, budget_s), device=self._origin())
         calibration_id = self._head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, report, {})
         colour = made.colour if isinstance(made, ColourReconstruction) else None
-        return CaptureRecord(capture, shot, shown, self._head.spec.name, colour)
+        return capture, partial(capture_files, capture, self._head.spec.name, shot, shown, colour)
 
     def live_picture(self, seen: LiveFrame) -> tuple[bytes, Aim]:
         """Return the live picture (JPEG) of a frame, and its aiming hint.

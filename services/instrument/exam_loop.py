@@ -31,8 +31,7 @@ from services.instrument.exam_state import ExamEvent
 from services.instrument.frame_feedback import FAILED_VERDICT
 from services.instrument.frame_sink import FrameSink
 from services.instrument.live_pictures import LivePictures
-from services.instrument.press_colours import colours_of_lamp
-from services.instrument.press_exposure import Exposure
+from services.instrument.press_exposure import Exposure, colours_of_lamp
 from services.instrument.resumption import ResumedPress, resumed_frames
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
@@ -239,13 +238,13 @@ class ExamLoop:
             shot.verdict.code,
         ):
             self._events.verdict(shot.id, verdict)  # a failed reconstruction is published with the stored capture
-        record = self._pipeline.record(shot, made, verdict, budget_s)
+        capture, files_of = self._pipeline.record(shot, made, verdict, budget_s)
         self._events.stage(shot.press, shot.id, "keep")
         target = shot.press.target
-        files = record.files()
+        files = files_of()
         deadline = Deadline.after(self._parts.clock, LOCK_PATIENCE_S)
         kept = _when_unlocked(
-            lambda: self._parts.store.save(record.capture, files, target.write_rows, target.request),
+            lambda: self._parts.store.save(capture, files, target.write_rows, target.request),
             lambda: self._serve_between_rounds(shot),
             lambda: not self._requests.snapshot.is_closing and deadline.left_s() > 0,
             self._events.problem,

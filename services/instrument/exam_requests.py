@@ -102,15 +102,13 @@ class ExamRequests:
                 raise refusal
             self._advance(ExamEvent.PRESS)
             self._pending = press
-            if press.key is not None:
-                self._idempotency_keys.remember(press.key, press)
+            self._idempotency_keys.remember(press)
         return press.future
 
     def remember(self, press: Press) -> None:
         """Store a press of the run before under its idempotency key: a repeated request gets its capture."""
-        if (key := press.key) is not None:
-            with self._lock:
-                self._idempotency_keys.remember(key, press)
+        with self._lock:
+            self._idempotency_keys.remember(press)
 
     async def preview(self, after: int, wait_s: float, wanted: LiveRequest) -> Preview | None:
         """Request live pictures; return the next one with a number above `after`, None after `wait_s` or at close."""

@@ -14,10 +14,6 @@ from services.instrument.frame_feedback import FrameAssessor
 Looked = Callable[[Image, bool], None]  # with the quick look of the first useful frame, and whether it is simulated
 
 
-def ignore_look(_: Image, simulated: bool) -> None:
-    """Do nothing with a quick look."""
-
-
 @dataclass(frozen=True)
 class AssessedFrame:
     """Verdict on a lit frame, and what is prepared of it; `prepared` is None for a useless frame."""

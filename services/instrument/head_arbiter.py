@@ -291,19 +291,9 @@ class HeadArbiter:
         return exam.head if (exam := self.owner.exam) is not None else None
 
     @property
-    def problem(self) -> DiffuscopeError | None:
-        """The error that prevents captures now (Busy while a valid calibration is repeated); None if there is none."""
-        return self.owner.problem
-
-    @property
     def findings(self) -> tuple[Finding, ...]:
         """The findings of the calibration monitor; empty while the exam does not own the head."""
         return exam.calibration_monitor.findings if (exam := self.owner.exam) is not None else ()
-
-    @property
-    def state(self) -> WireState:
-        """The state of the exam; `busy` while the exam does not own the head."""
-        return self.owner.state
 
     @property
     def calibration_error(self) -> DiffuscopeError | None:

@@ -8,21 +8,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from device.clock import Clock
+from device.config.head_file import InstrumentSpec
 from device.errors import DiffuscopeError
 from device.head import Head
 from device.light_safety.burst import burst, require_lit
+from device.optics.matrix import lamps_of
 from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.recon.burst_reconstructor import PreparedFrame
 from device.values import ChannelUse, Colour, Counts, ExposureSettings, Eye, Frame, Illumination
 from services.instrument.frame_preparation import AssessedFrame
+from services.records.capture import OtherColour
 
 log = logging.getLogger(__name__)
 
 Taken = Callable[[Frame, float, float], None]  # frame, dose and duration of the press until its read-out
-
-
-def ignore_frame(_: Frame, dose_j_per_cm2: float, exposed_s: float) -> None:
-    """Do nothing with a frame that was taken."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def expose_press(
     count: int = 1,
     colours: Sequence[Colour] = (),
     field: str | None = None,
-    taken: Taken = ignore_frame,
+    taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
     split: ExposureSplit = WHOLE,
 ) -> Exposure:
     """Return a dark frame, up to `count` lit ones, and one in each of `colours`; they are exposed in this order.
@@ -186,6 +185,17 @@ class _Exposing:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})
                 missing.append(ChannelUse(colour, None, reason=error.message, code=error.code))
         return taken, tuple(missing)
+
+
+def colours_of_lamp(spec: InstrumentSpec, wanted: Sequence[OtherColour]) -> tuple[OtherColour, ...]:
+    """Return the `wanted` colours, amber in place of red on a ring that has amber and no red LEDs.
+
+    Amber light stands for red in the picture. A colour that the ring does not have stays: the press reports it.
+    """
+    lamps = lamps_of(spec)
+    if lamps is None or "red" in lamps or "amber" not in lamps:
+        return tuple(wanted)
+    return tuple(dict.fromkeys("amber" if colour == "red" else colour for colour in wanted))
 
 
 def expose_live(head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False) -> LiveFrame:

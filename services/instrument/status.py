@@ -29,8 +29,8 @@ def read_status(arbiter: HeadArbiter) -> InstrumentStatus:
     thermometer = chips.thermometer
     findings = arbiter.findings
     return InstrumentStatus(
-        state=arbiter.state,
-        problem=arbiter.problem,
+        state=arbiter.owner.state,
+        problem=arbiter.owner.problem,
         calibration_error=arbiter.calibration_error or _calibration_failure(findings),
         findings=findings,
         battery=_reading(lambda: battery.read().fraction) if battery else None,

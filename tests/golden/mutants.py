@@ -147,8 +147,8 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ),
     (
         "services/instrument/capture.py",
-        "illumination=light, simulated=simulated)",
-        "illumination=light, simulated=False)",
+        "simulated=frame.simulated)",
+        "simulated=False)",
         "encoded_files_of_a_capture",
     ),
     (
@@ -379,8 +379,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         REQUESTS,
-        "self._idempotency_keys.remember(press.key, press)",
-        "pass",
+        "            self._pending = press\n            self._idempotency_keys.remember(press)",
+        "            self._pending = press",
         exam("test_the_same_key_is_the_same_picture_while_it_is_made_and_afterwards"),
     ),
     Mutant(LOOP, "        target.permit()  # again", "        #", "tests/journey/test_consent.py"),

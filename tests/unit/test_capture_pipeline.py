@@ -132,12 +132,11 @@ def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
     shot = bench.exposed()
     *_, made = bench.pipeline.reconstruct(shot, budget_s=5.0)
     assert isinstance(made, Reconstruction)
-    record = bench.pipeline.record(shot, made, bench.pipeline.reassess(shot, made.report), 5.0)
-    capture = record.capture
+    capture, files_of = bench.pipeline.record(shot, made, bench.pipeline.reassess(shot, made.report), 5.0)
     assert (capture.id, capture.eye, capture.simulated) == (shot.id, "OD", True)
     assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
     assert capture.report.seconds["expose"] == pytest.approx(shot.exposure.duration_s)
-    assert set(record.files()) == {"raw.tiff", "dark.tiff", "picture.png", "green.jpg", "quick.jpg", "report.json"}
+    assert set(files_of()) == {"raw.tiff", "dark.tiff", "picture.png", "green.jpg", "quick.jpg", "report.json"}
 
 
 def test_a_live_picture_is_exposed_in_the_aiming_colour(bench: Bench) -> None:

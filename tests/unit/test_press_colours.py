@@ -11,8 +11,7 @@ from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.recon.colour_reconstructor import ColourReconstruction
 from services.instrument.capture_pipeline import plan_pipeline
-from services.instrument.press_colours import colours_of_lamp
-from services.instrument.press_exposure import expose_press
+from services.instrument.press_exposure import colours_of_lamp, expose_press
 from services.records.capture import OtherColour
 from tests.simulated import coarse
 

@@ -83,13 +83,13 @@ def status_answer(
     """Return the status of the instrument."""
     spec = arbiter.context.spec
     head = arbiter.head
-    problem = arbiter.problem
+    problem = arbiter.owner.problem
     store = arbiter.context.store
     radius_px = field_radius_px(head.calibration) if head is not None else float("inf")
     return StatusAnswer(
         name=spec.name,
         kind=kind_of(spec),
-        state=arbiter.state,
+        state=arbiter.owner.state,
         shape=head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
         field_px=2 * radius_px if radius_px < float("inf") else None,
         version=VERSION,
