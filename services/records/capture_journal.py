@@ -29,6 +29,7 @@ from services.records.storage_errors import storage_errors
 JOURNAL = "journal"  # folder in the store
 MAX_ATTEMPTS = 2  # starts that try to reconstruct the frames of a capture: they may be what ends the process
 _ATTEMPT = "attempt-{}"
+_Plan = tuple[int, tuple[OtherColour, ...]]  # number of frames in the picture's colour, other colours
 
 
 @dataclass(frozen=True)
@@ -76,9 +77,9 @@ class CaptureJournal:
         self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
             atomic_io.make_folder(self._folder)
-            paths = files_in(self._folder, "*.json")
-            found = {path.stem: _read(path) for path in paths}
-            self._keys = {path.stem: _key(path) for path in paths}
+            entries = {path.stem: _entries(path) for path in files_in(self._folder, "*.json")}
+        found = {id: _capture(id, entry) for id, entry in entries.items()}
+        self._keys = {id: _key(entry) for id, entry in entries.items()}
         for id in [id for id in found if _is_kept(store, id)]:
             del found[id]
             self.end(id)
@@ -87,7 +88,8 @@ class CaptureJournal:
                 found[name] = InterruptedCapture(name, _eye_in(name))
         if store.refusal is None:
             self._remove_strays()
-            self.resumable = tuple(one for id in self._keys if id in found if (one := self._resumable(found[id])))
+            kept = ((found[id], _plan(entry)) for id, entry in entries.items() if id in found)
+            self.resumable = tuple(one for press, plan in kept if (one := self._resumable(press, plan)))
         resumable = {one.press.id for one in self.resumable}
         self.interrupted = tuple(one for id, one in found.items() if id not in resumable)
 
@@ -184,14 +186,13 @@ class CaptureJournal:
         for writer in self._writers.values():
             writer.close(complete=True)
 
-    def _resumable(self, press: InterruptedCapture) -> ResumableCapture | None:
-        """Return an interrupted capture with its frames.
+    def _resumable(self, press: InterruptedCapture, plan: _Plan | None) -> ResumableCapture | None:
+        """Return an interrupted capture with its frames; `plan`: what was to be taken.
 
         None, and its frames are deleted, without a lit one, without a readable entry or after MAX_ATTEMPTS.
         """
         folder = self._folder / press.id
         frames = stored_frames(folder)
-        plan = _plan(self._folder / f"{press.id}.json")
         if plan is None or not any(one.is_lit for one in frames) or _attempts(folder) >= MAX_ATTEMPTS:
             with suppress(StoreError):  # then the next opening deletes them
                 self._remove_frames(press.id)
@@ -222,33 +223,28 @@ def _is_kept(store: CaptureStore, id: str) -> bool:
     return True
 
 
-def _read(path: Path) -> InterruptedCapture:
-    """Return the interrupted capture in an entry; with id and eye only if the entry is incomplete or has changed."""
+def _capture(id: str, entry: JsonObject) -> InterruptedCapture:
+    """Return the interrupted capture of an entry; with id and eye only if the entry has no valid content."""
     try:
-        entry = _entries(path)
         eye = row_validation.one_of(entry["eye"], *EYES, None)
         visit, slot = (None if entry[name] is None else row_validation.text(entry[name]) for name in ("visit", "slot"))
-        return InterruptedCapture(path.stem, eye, visit, slot, whole_number(entry["tries"]))
+        return InterruptedCapture(id, eye, visit, slot, whole_number(entry["tries"]))
     except (ValueError, KeyError, TypeError):
-        return InterruptedCapture(path.stem, _eye_in(path.stem))
+        return InterruptedCapture(id, _eye_in(id))
 
 
-def _key(path: Path) -> str | None:
-    """Return the idempotency key in a journal entry; None without one, or if the entry cannot be read."""
-    try:
-        key = _entries(path).get("key")
-    except ValueError:
-        return None
+def _key(entry: JsonObject) -> str | None:
+    """Return the idempotency key in an entry; None without one."""
+    key = entry.get("key")
     return key if isinstance(key, str) else None
 
 
-def _plan(path: Path) -> tuple[int, tuple[OtherColour, ...]] | None:
-    """Return the number of lit frames, and the other colours, that were to be taken; None if it cannot be read."""
+def _plan(entry: JsonObject) -> _Plan | None:
+    """Return the plan in an entry; None without one."""
     try:
-        entries = _entries(path)
-        colours = entries["colours"]
+        colours = entry["colours"]
         named = colours if isinstance(colours, list) else []
-        return whole_number(entries["planned"]), tuple(one for one in OTHER_COLOURS if one in named)
+        return whole_number(entry["planned"]), tuple(one for one in OTHER_COLOURS if one in named)
     except (ValueError, KeyError):
         return None
 
@@ -258,8 +254,11 @@ def _attempts(folder: Path) -> int:
 
 
 def _entries(path: Path) -> JsonObject:
-    """Return the entries of a journal file; ValueError if it is incomplete or has changed."""
-    return digested_json.decoded(path.read_bytes())
+    """Return the entries of a journal file; none if it is incomplete or has changed."""
+    try:
+        return digested_json.decoded(path.read_bytes())
+    except ValueError:
+        return {}
 
 
 def _eye_in(name: str) -> Eye | None:
