@@ -51,17 +51,9 @@ class Relay:
         """Return the width of one pixel on the retina of an eye of that focal length, um."""
         return pitch_um * eye_mm / (self.angular_magnification * self.diffuser_to_sensor_mm)
 
-    def dot_px(self, dot_um: float, pitch_um: float, eye_mm: float) -> float:
-        """Return the diameter on the sensor of a dot on the retina or the screen, px."""
-        return dot_um / self.retina_um_per_px(pitch_um, eye_mm)
-
     def scale_per_dpt(self) -> float:
         """Return z a^2, the relative scaling of the caustic per dioptre."""
         return self.diffuser_to_sensor_mm / 1000 * self.angular_magnification**2
-
-    def edge_shift_um_per_dpt(self) -> float:
-        """Return the shift of the caustic's edge on the sensor per dioptre of refraction, um."""
-        return self.scale_per_dpt() * self.iris_mm / 2 * 1000
 
     def led_cone_deg(self, field_deg: float) -> float:
         """Return the full cone of an LED that lights a field, degrees: theta_illum = (f2 / f1) theta_LED."""

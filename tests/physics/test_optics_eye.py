@@ -22,6 +22,7 @@ from device.optics.eye import (
 from tests.textbook.image_surfaces import petzval_mm
 
 PAPER = Relay()
+DOT_PX = 275 / PAPER.retina_um_per_px(5.04, 25)  # diameter on the sensor of a dot of 275 um on the retina
 OPTICS = OpticsSpec(iris_um=3200, diffuser_to_sensor_um=6000, angular_magnification=0.75, field_deg=33.4)
 
 GOLDEN = {
@@ -41,9 +42,9 @@ GOLDEN = {
     "slope of the diffuser, mrad": (1000 * slope_sigma(OPTICS), 3.7059),
     "path of the diffuser, um": (opd_sigma_um(OPTICS), 0.18343),
     "scale per dioptre": (PAPER.scale_per_dpt(), 0.003375),
-    "edge shift, um per dpt": (PAPER.edge_shift_um_per_dpt(), 5.4),
-    "dot on the sensor, px": (PAPER.dot_px(275, 5.04, 25), 9.82),
-    "dot's null, cycles per mm": (1.22 / (PAPER.dot_px(275, 5.04, 25) * 5.04e-3), 24.6),
+    "edge shift, um per dpt": (PAPER.scale_per_dpt() * PAPER.iris_mm / 2 * 1000, 5.4),
+    "dot on the sensor, px": (DOT_PX, 9.82),
+    "dot's null, cycles per mm": (1.22 / (DOT_PX * 5.04e-3), 24.6),
     "ring at the pupil, mm": (PAPER.ring_at_pupil_mm(9.5), 7.125),
     "iris at the eye, mm": (PAPER.iris_at_eye_mm, 2.4),
     "cone of an LED for 33 deg": (PAPER.led_cone_deg(33), 24.75),

@@ -8,16 +8,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from device.calibration.archive import Archive
-from device.calibration.monitoring.dark_current_model import DarkStep, dark_dn_at, fit_dark_current
+from device.calibration.archive import Archive, StoredCalibration
+from device.calibration.monitoring.dark_current_model import DarkCurrentModel, DarkStep, fit_dark_current
 from device.calibration.procedure.calibration_sequence import CalibrationJob, CalibrationSequence, Operator
 from device.head import target_placer
 from device.sim import calibration_targets
 from device.sim.camera import SimCamera
 from device.sim.chips import SimThermometer
 from device.sim.world import World
-from device.values import ExposureSettings
+from device.values import ExposureSettings, Image
 from tests.unit.test_calibration_measurements import small_world
+
+
+def dark_dn_at(kept: StoredCalibration, temperature_c: float) -> Image | None:
+    """Return the dark frame at another temperature, (rows, cols), DN; None without a model, a dark frame or a gain."""
+    figures = dict(kept.provenance.figures)
+    sensor = kept.calibration.sensor
+    dark_dn = kept.calibration.dark_dn
+    if "dark_doubling_c" not in figures or dark_dn is None or sensor.gain_e_per_dn is None:
+        return None
+    model = DarkCurrentModel(figures["dark_25c_e_per_s"], figures["dark_doubling_c"], int(figures["dark_law_steps"]))
+    more_e = (model.e_per_s_at(temperature_c) - model.e_per_s_at(figures["dark_c"])) * figures["dark_map_s"]
+    return np.asarray(dark_dn + np.float32(more_e / sensor.gain_e_per_dn))
 
 
 def calibrated(world: World, root: Path, temperature_c: float, messages: list[str], serial: str = "D-1") -> str:

@@ -10,9 +10,8 @@ from math import isfinite
 
 import numpy as np
 
-from device.calibration.archive import Archive, StoredCalibration
+from device.calibration.archive import Archive
 from device.errors import CalibrationError
-from device.values import Image
 
 REFERENCE_C = 25.0
 MIN_TEMPERATURE_RANGE_C = 3.0
@@ -74,15 +73,3 @@ def dark_steps(archive: Archive, serial: str) -> Sequence[DarkStep]:
         if provenance.serial == serial and "dark_c" in figures:
             found.append(DarkStep(figures["dark_c"], figures["dark_e_per_s"]))
     return found
-
-
-def dark_dn_at(kept: StoredCalibration, temperature_c: float) -> Image | None:
-    """Return the dark frame at another temperature, (rows, cols), DN; None without a model, a dark frame or a gain."""
-    figures = dict(kept.provenance.figures)
-    sensor = kept.calibration.sensor
-    dark_dn = kept.calibration.dark_dn
-    if "dark_doubling_c" not in figures or dark_dn is None or sensor.gain_e_per_dn is None:
-        return None
-    model = DarkCurrentModel(figures["dark_25c_e_per_s"], figures["dark_doubling_c"], int(figures["dark_law_steps"]))
-    more_e = (model.e_per_s_at(temperature_c) - model.e_per_s_at(figures["dark_c"])) * figures["dark_map_s"]
-    return np.asarray(dark_dn + np.float32(more_e / sensor.gain_e_per_dn))
