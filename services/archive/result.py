@@ -82,12 +82,16 @@ class Stored:
 
     @property
     def reconstruction(self) -> CaptureReport:
-        """Report of the reconstruction; SettingError if it cannot be read."""
+        """Report of the reconstruction; SettingError if it, or what it says of its colours, cannot be read."""
+        stored = self.report.get("report")
         try:
-            return CaptureReport.read(self.report.get("report"))
+            report = CaptureReport.read(stored)
+            if not report.channels and isinstance(stored, dict) and stored.get("channels"):
+                raise ValueError("channels: of another form")  # they say which colours are predicted
         except ValueError as error:
             message = f"a result's report cannot be read: {error}"
             raise SettingError(message, "Delete the result's folder, and run the plan again.") from error
+        return report
 
 
 class ResultFolder:

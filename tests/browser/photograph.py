@@ -104,8 +104,8 @@ def shots(camera: Camera, real: Real) -> None:
     """Save screenshots of a capture: in progress, assessed, each poor verdict, retakes exhausted, good."""
     page = camera.page
     address = page.url
-    real.hold = "expose"
     for cause in POOR:
+        real.hold = "expose" if cause == "dark" else None  # too bright a frame has no quick look
         visit = real.begin_visit(consent="agreed", sex="woman", age=54)["id"]
         page.goto(f"{real.url}/#/visit/{visit}/aim/R-centre")
         page.wait_for_selector("eye-live[data-frame]")

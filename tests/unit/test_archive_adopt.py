@@ -1,6 +1,7 @@
 """Adoption of results by a store, in one process: pictures, and what is refused with a remedy."""
 
 import json
+from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import tifffile
 from PIL import Image
 
 from device.clock import VirtualClock
+from device.errors import SettingError
+from device.values import ChannelUse
 from services.archive.adopt import Adopted, adopt_results
 from services.archive.content import software
 from services.archive.plan import Plan, PlannedCalibration, PlannedCapture, PlanSettings
-from services.archive.result import ResultFolder
+from services.archive.result import ResultFolder, Stored
 from services.records.capture import RecordOrigin
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import FILE
@@ -63,7 +66,7 @@ def write_results(
     results, picture = ResultFolder(folder), np.arange(48, dtype=np.float32).reshape(6, 8) + 1
     folder.mkdir()
     results.prepare(plan)
-    report = {"method": "variation", "channels": [{"name": "blue", "predicted": True}]}
+    report = {"method": "variation", "channels": [asdict(ChannelUse("blue", None, predicted=True))]}
     document = {"report": report, "simulated": simulated, "field_px": [1, 5, 1, 7]}
     for one in captures:
         if one.id not in without:
@@ -97,6 +100,13 @@ def test_the_field_of_each_result_becomes_a_picture_with_its_marks(store: Path, 
         assert json.loads(kept.read("one", version.report))["report"]["method"] == "variation"
         assert kept.get("two").report.versions == ()
     assert adopted(tmp_path / "out", store) == Adopted(adopted=0, known=1, missing=1, refused=())
+
+
+def test_a_result_that_does_not_say_which_colours_are_predicted_is_refused() -> None:
+    whole, half = asdict(ChannelUse("blue", None, predicted=True)), {"name": "blue", "predicted": True}
+    assert Stored({"report": {"method": "variation", "channels": [whole]}}, {}).predicted == ("blue",)
+    with pytest.raises(SettingError, match="channels"):
+        _ = Stored({"report": {"method": "variation", "channels": [half]}}, {}).predicted
 
 
 def test_what_does_not_belong_to_the_store_is_refused_and_the_rest_adopted(store: Path, tmp_path: Path) -> None:
