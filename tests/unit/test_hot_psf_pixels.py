@@ -45,10 +45,20 @@ def points(step_px: int, dark_dn: float) -> Any:
     return np.random.default_rng(6).normal(dark_dn + spots, 1.0)
 
 
+def fine_grain() -> Any:
+    """Return the counts of a PSF of grains of one to two pixels in the dark, most of them beside no other."""
+    rng = np.random.default_rng(5)
+    grain = gaussian_filter(rng.standard_normal(SHAPE), 0.8)
+    light = np.maximum(grain - 1.2 * grain.std(), 0) ** 2
+    return rng.poisson(light / light.max() * 12_000) / 4
+
+
 SHARP: dict[str, Callable[[], Any]] = {
     "diffuser": measured,
     "one pixel": lambda: points(60, 0) * (np.indices(SHAPE) < 60).all(axis=0),
     "points": lambda: points(16, 64),
+    "points of two pixels": lambda: gaussian_filter(points(16, 64), 0.8),
+    "fine grain": fine_grain,
     "one pixel of half the light": lambda: (
         gaussian_filter(points(60, 64), 20) + 4e6 * (np.indices(SHAPE) == 48).all(axis=0)
     ),

@@ -435,7 +435,10 @@ def without_hot_pixels(psf: Psf) -> Psf:
 
 
 def _hot_pixels(pixels: Image) -> Places:
-    """Return the flat indices of the hot pixels in the image of a PSF (rows, cols), of sum 1."""
+    """Return the flat indices of the hot pixels in the image of a PSF (rows, cols), of sum 1.
+
+    None if they are many among its bright pixels: then points are what the PSF consists of, and their rings are dark.
+    """
     none = np.empty(0, np.int64)
     if min(pixels.shape) < 5:
         return none
@@ -455,4 +458,5 @@ def _hot_pixels(pixels: Image) -> Places:
     kernels.outliers(pixels, zero_row, known, places, limit * noise.per_dn, limit * noise.floor_dn2, HOT_RANGES, is_hot)
     found = places[is_hot]
     are_points = float(pixels.ravel()[found].sum(dtype=np.float64)) > MAX_HOT_LIGHT
-    return none if are_points or found.size > MAX_OUTLIERS * pixels.size else found
+    bright = np.count_nonzero(pixels > least)
+    return none if are_points or found.size > MAX_OUTLIERS * bright else found
