@@ -17,7 +17,6 @@ from device import atomic_io
 from device.calibration.archive import Archive
 from device.clock import SystemClock, VirtualClock
 from device.errors import CalibrationMissing
-from device.values import Report
 from services.errors import RecordRemoved
 from services.records import schema
 from services.records.capture import Capture, CaptureReport
@@ -50,7 +49,7 @@ ADOPTED = "adopted"
 
 def capture(name: str, second: int = 0) -> Capture:
     taken_at = datetime(2026, 3, 1, 12, tzinfo=UTC) + timedelta(seconds=second)
-    return Capture(name, "OS", taken_at, False, "00ff", CaptureReport(Report("wiener")), {})
+    return Capture(name, "OS", taken_at, False, "00ff", CaptureReport("wiener"), {})
 
 
 def people(store: CaptureStore) -> VisitRepository:

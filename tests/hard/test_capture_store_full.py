@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 from device.errors import StoreFull
-from device.values import Report
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 
@@ -26,7 +25,7 @@ FILES = {"raw.tiff": b"r" * 18_000, "picture.png": b"p" * 3000}
 
 
 def capture(name: str) -> Capture:
-    return Capture(name, "OS", datetime(2026, 3, 1, 12, tzinfo=UTC), False, "00ff", CaptureReport(Report("wiener")), {})
+    return Capture(name, "OS", datetime(2026, 3, 1, 12, tzinfo=UTC), False, "00ff", CaptureReport("wiener"), {})
 
 
 def run(mode: str, folder: Path, prefix: tuple[str, ...] = ()) -> Any:

@@ -21,7 +21,6 @@ from typing import Any
 import pytest
 
 from device import atomic_io
-from device.values import Report
 from services.records import capture_store as product
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
@@ -42,7 +41,7 @@ def folder_of_stores() -> Iterator[Path]:
 
 def capture(name: str, second: int = 0) -> Capture:
     taken_at = datetime(2026, 3, 1, 12, tzinfo=UTC) + timedelta(seconds=second)
-    return Capture(name, "OS", taken_at, False, "00ff", CaptureReport(Report("wiener")), {})
+    return Capture(name, "OS", taken_at, False, "00ff", CaptureReport("wiener"), {})
 
 
 def is_complete(store: CaptureStore, id: str) -> bool:
