@@ -183,7 +183,7 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ),
     (
         "services/instrument/capture_pipeline.py",
-        "PREVIEW_PX, made.simulated)",
+        "PREVIEW_PX, simulated)",
         "PREVIEW_PX, False)",
         "quick_look_and_live_picture",
     ),
