@@ -197,7 +197,7 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
         "services/instrument/exam_events.py",
         "to_jpeg(look, THUMBNAIL_PX, simulated)",
         "to_jpeg(look, THUMBNAIL_PX, False)",
-        "files_of_a_capture",
+        "quick_look_in_progress",
     ),
     (
         "services/instrument/visit_montage.py",

@@ -43,8 +43,13 @@ from services.imaging.raw_metadata import RawMetadata
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
 from services.instrument.camera_tap import CameraTap
 from services.instrument.capture import ExposedCapture, Press, capture_files
+from services.instrument.events import EventBus
+from services.instrument.exam_events import ExamEvents
+from services.instrument.exam_requests import ExamRequests
 from services.instrument.press_exposure import Exposure
+from services.instrument.progress import Progress
 from services.instrument.visit_montage import join_pictures
+from services.instrument.watchdog import Watchdog
 from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_target import CaptureTarget
 from services.research.frontier import measure_scene
@@ -357,6 +362,16 @@ def test_encoded_files_of_a_capture(simulated: bool) -> None:
     for name, content in files.items():
         assert isinstance(content, bytes)
         assert stated_in(name, io.BytesIO(content)) is simulated, name
+
+
+@both
+def test_quick_look_in_progress(simulated: bool) -> None:
+    """The page shows it before the files of the capture are stored."""
+    clock = VirtualClock()
+    events = ExamEvents(EventBus(), Watchdog(None), Progress(clock, 0.1, lambda: 0.26), ExamRequests(clock))
+    picture = np.random.default_rng(0).uniform(0, 1, (90, 120)).astype(np.float32)
+    events.quick_look(Press(Future(), "OD", CaptureTarget(), None), "a", picture, simulated)
+    check_pixels("quick.jpg", events.output.quick_looks["a"], simulated)
 
 
 def test_quick_look_and_live_picture(taken: tuple[Rig, Any, bool]) -> None:
