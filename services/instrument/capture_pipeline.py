@@ -267,7 +267,7 @@ class CapturePipeline:
         deadline = Deadline.after(self._clock, PREVIEW_BUDGET_S)
         try:
             picture = self.live(counts, simulated=simulated, deadline=deadline, quick=True).picture
-        except FrameError:
+        except FrameError:  # saturated: for any other useless frame the hint above has raised it
             picture = counts.astype(np.float32)
         jpeg = picture_files.to_jpeg(crop_to_field(picture, self._head), PREVIEW_PX, simulated)
         return jpeg, aim
