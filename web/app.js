@@ -137,6 +137,11 @@ const eventHandlers = {
   state: ({ state }) => set({ activity: state }),
   aim: showAim,
 
+  /** The button on the handle: the page that aims and has control takes the picture. */
+  button() {
+    if (get().route.screen === "aim" && get().hasControl) actions.take();
+  },
+
   /** An advisory alert begins, changes (`n`) or ends. */
   notice({ code, over: gone, ...more }) {
     set({ noticeCount: get().noticeCount + 1 });

@@ -33,6 +33,7 @@ from services.instrument.frame_sink import FrameSink
 from services.instrument.live_pictures import LivePictures
 from services.instrument.press_exposure import Exposure, colours_of_lamp
 from services.instrument.resumption import ResumedPress, resumed_frames
+from services.instrument.shutter_button import ShutterButton
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
@@ -79,8 +80,15 @@ class ExamLoop:
         self._requests = parts.requests
         self._events = parts.events
         self._pipeline = pipeline
+        self._button = ShutterButton(parts.head.button, parts.events)
         self._live = LivePictures(
-            parts.head, parts.clock, pipeline, parts.requests, parts.events, parts.store.refuse_light_in_vain
+            parts.head,
+            parts.clock,
+            pipeline,
+            parts.requests,
+            parts.events,
+            parts.store.refuse_light_in_vain,
+            self._button,
         )
         self._exposed: deque[ExposedCapture] = deque()
         self._resumed = deque(parts.resumed)
@@ -95,6 +103,7 @@ class ExamLoop:
     def step(self, now: ExamSnapshot) -> bool:
         """Run the most urgent action in the state `now`; return whether there was one."""
         self._parts.watchdog.beat()
+        self._button.poll()
         if now.has_press:
             self._expose_pending()
         elif self._exposed:

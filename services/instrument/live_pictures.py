@@ -10,6 +10,7 @@ from services.instrument.capture_pipeline import CapturePipeline
 from services.instrument.exam_events import ExamEvents
 from services.instrument.exam_requests import ExamRequests
 from services.instrument.press_exposure import LiveFrame, expose_live
+from services.instrument.shutter_button import ShutterButton
 
 RETRY_S = 1.0
 
@@ -28,6 +29,7 @@ class LivePictures:
         requests: ExamRequests,
         events: ExamEvents,
         refuse_in_vain: Callable[[], None],
+        button: ShutterButton,
     ) -> None:
         self._head = head
         self._clock = clock
@@ -35,6 +37,7 @@ class LivePictures:
         self._requests = requests
         self._events = events
         self._refuse_in_vain = refuse_in_vain
+        self._button = button
 
     @property
     def are_wanted(self) -> bool:
@@ -78,4 +81,5 @@ class LivePictures:
         """Sleep with the lamp off until `duration_s` is over, a press arrives, or the exam closes."""
         until_s = self._clock.now_s() + duration_s
         while not self._requests.snapshot.is_interrupted and (left_s := until_s - self._clock.now_s()) > 0:
+            self._button.poll()
             self._clock.sleep(min(left_s, 0.02))

@@ -250,6 +250,18 @@ def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: 
     expect(page.locator("eye-live[data-frame]")).to_have_count(0)  # the frame of the right eye is gone
 
 
+def test_the_button_on_the_handle_takes_the_picture_of_the_page_that_aims(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    real.event_bus.publish("button")
+    expect(page.locator("[data-phase=kept] #result-title")).to_be_visible(timeout=30_000)
+    real.event_bus.publish("button")
+    page.goto(f"{real.url}/#/")
+    expect(page.locator("#continue, #start").first).to_be_visible()
+    real.event_bus.publish("button")
+    page.wait_for_timeout(500)  # for a press that must not come
+    assert len(real.request("GET", "/api/captures")) == 1
+
+
 def test_warnings_about_a_picture_are_shown_with_it(open_page: Open, real: Real) -> None:
     real.show("saturated")
     page = aiming(open_page, real, (800, 1280))

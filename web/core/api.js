@@ -179,7 +179,7 @@ export async function getPicture(url, signal) {
 
 const HEARTBEAT_TIMEOUT_MS = 3500; // heartbeat timeout; the server sends one event per second
 const RECONNECT_MS = 2500; // a half-open connection can look connected for minutes, so the stream is reopened
-const EVENTS = ["beat", "state", "stage", "verdict", "kept", "failed", "aim", "notice"];
+const EVENTS = ["beat", "state", "stage", "verdict", "kept", "failed", "aim", "button", "notice"];
 
 /**
  * Event stream of the visible page, with heartbeat timeout and reconnection. A hidden page closes its stream, because

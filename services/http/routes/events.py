@@ -22,13 +22,12 @@ def event_router(arbiter: HeadArbiter) -> APIRouter:
     async def events(last_event_id: int | None = Header(None, ge=0)) -> EventStream:
         """Stream server-sent events, with a heartbeat (`beat`) every second.
 
-        `state`: state of the instrument. `aim`: aiming hint. `stage`: progress of a capture (`fraction` 0 to 1, seconds
-        `left_s`). `verdict`: image quality of a capture. `kept`: a stored capture. `failed`: an error (`code`,
-        `message`, `remedy`). `accuracy`: progress of the accuracy explorer.
+        `state`: state of the instrument. `aim`: aiming hint. `button`: the button on the handle was pressed. `stage`:
+        progress of a capture (`fraction` 0 to 1, seconds `left_s`). `verdict`: image quality of a capture. `kept`: a
+        stored capture. `failed`: an error (`code`, `message`, `remedy`). `accuracy`: progress of the accuracy explorer.
         `notice`: an alert, by its `code`, is active from now on, with its values (`n`, `date`, `wait_s`), or ended
         (`over`); alerts that are active already are part of the status. `calibration`: new findings of the calibration
-        monitor. With `Last-Event-ID` the stream resumes after that event. 503 if too many streams are
-        open.
+        monitor. With `Last-Event-ID` the stream resumes after that event. 503 if too many streams are open.
         """
 
         async def lines() -> AsyncIterator[str]:

@@ -87,6 +87,10 @@ class CalibrationFindings(ResponseBody):
     findings: list[FindingAnswer]
 
 
+class ButtonPress(ResponseBody):
+    """Press of the button on the handle: the page that aims takes a picture."""
+
+
 class HeartbeatEvent(ResponseBody):
     """Event `beat`."""
 
@@ -106,6 +110,13 @@ class AimEvent(ResponseBody):
 
     event: Literal["aim"]
     data: AimingHint
+
+
+class ButtonEvent(ResponseBody):
+    """Event `button`."""
+
+    event: Literal["button"]
+    data: ButtonPress
 
 
 class StageEvent(ResponseBody):
@@ -161,6 +172,7 @@ ServerSentEvent = Annotated[
     HeartbeatEvent
     | StateEvent
     | AimEvent
+    | ButtonEvent
     | StageEvent
     | VerdictEvent
     | KeptEvent

@@ -1,0 +1,37 @@
+"""Shutter button on the handle: each press is an event, upon which the page that aims takes the picture."""
+
+import logging
+
+from device.errors import BusFault
+from device.ports import Button
+from services.instrument.exam_events import ExamEvents
+
+log = logging.getLogger(__name__)
+
+
+class ShutterButton:
+    """Publisher of the presses of a head's button; None: a head without one. Not thread-safe: the thread `head` polls.
+
+    The page sends the press, since it knows visit and slot, and holds the control lease.
+    """
+
+    def __init__(self, button: Button | None, events: ExamEvents) -> None:
+        self._button, self._events = button, events
+        self._since_s: float | None = None
+        self._is_silent = False
+
+    def poll(self) -> None:
+        """Publish a press that began since the last poll; one that lies between two polls is missed."""
+        if self._button is None:
+            return
+        try:
+            since_s = self._button.pressed_since_s()
+        except BusFault as error:  # the page's own button stays
+            if not self._is_silent:
+                log.warning("the shutter button cannot be read: %s", error, extra={"code": error.code})
+            self._is_silent = True
+            return
+        self._is_silent = False
+        if since_s is not None and since_s != self._since_s:
+            self._events.button()
+        self._since_s = since_s
