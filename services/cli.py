@@ -143,7 +143,7 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
 
         if head is not None:
             raise typer.BadParameter("choose --head or a recording (--replay, --raw with --psf), not both")
-        stack = tuple(one for one in psf_stack(psfs) if isinstance(one, Path))
+        stack = tuple(path for path in psf_stack(psfs) if isinstance(path, Path))
         return recording_spec(replay or raws[0].parent if raws else replay or Path(), raws, stack)
     return load_head(head or SIM_HEAD)
 
@@ -285,7 +285,7 @@ def montage(
 
     joined = montage_files(picture, output, report, say, head)
     rows, cols = joined.picture.shape[:2]
-    used = sum(one.used for one in joined.placed)
+    used = sum(place.used for place in joined.placed)
     typer.echo(f"{output}: {used} of {len(picture)} pictures on the {joined.projection}, {rows} x {cols} pixels")
     for line in placed_lines(joined, picture):
         say(line)
@@ -563,7 +563,7 @@ def check_head(
     found = check_calibration(spec, data or _default_data(), SystemClock(), say)
     typer.echo(f"calibration {found.kept.calibration.id} of {found.kept.provenance.serial}")
     typer.echo(table(found))
-    raise typer.Exit(1 if any(one.fails for one in found.findings) else 0)
+    raise typer.Exit(1 if any(finding.fails for finding in found.findings) else 0)
 
 
 def _check_model_eye(
@@ -731,8 +731,8 @@ def bench_data_set(
     with installed_peer(None if no_peers else peers, benchmark.LENSLESS_ROUNDS, say) as peer:
         found = benchmark.benchmark(request, peer, SystemClock(), say)
     typer.echo(table(found.rows))
-    for one in found.left_out:
-        typer.echo(f"left out: {one}")
+    for left_out in found.left_out:
+        typer.echo(f"left out: {left_out}")
     raise typer.Exit(1 if found.left_out else 0)
 
 

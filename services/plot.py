@@ -155,15 +155,15 @@ def stacked_svg(plots: Sequence[Plot], between: Sequence[Panel] = ()) -> str:
     Panels stand `between` the first plot and the others.
     """
     every: list[Plot | Panel] = [plots[0], *between, *plots[1:]]
-    wide = max(one.width for one in every)
-    tall = sum(one.height for one in every)
+    wide = max(part.width for part in every)
+    tall = sum(part.height for part in every)
     panels = []
     down = 0
-    for one in every:
-        elements = _elements(one) if isinstance(one, Plot) else one.elements
+    for part in every:
+        elements = _elements(part) if isinstance(part, Plot) else part.elements
         panels += [f'<g transform="translate(0 {down})">', *elements, "</g>"]
-        down += one.height
-    return document(wide, tall, plots[0].title, " ".join(one.description for one in every), panels)
+        down += part.height
+    return document(wide, tall, plots[0].title, " ".join(part.description for part in every), panels)
 
 
 def document(
@@ -270,7 +270,7 @@ def _limit(plot: Plot) -> list[str]:
 
 def _by_kind(plot: Plot) -> list[tuple[int, Series]]:
     """Return the series with the number of their shape and colour."""
-    return [(place if one.kind is None else one.kind, one) for place, one in enumerate(plot.series)]
+    return [(place if series.kind is None else series.kind, series) for place, series in enumerate(plot.series)]
 
 
 def _series(plot: Plot) -> list[str]:
@@ -367,7 +367,7 @@ def _labels(plot: Plot) -> list[str]:
         taken.append((x - GAP_PX, y - LINE_PX, x + 6 + LETTER_PX * len(plot.limit[1]) + GAP_PX, y + GAP_PX))
     labelled = [(k, mark) for k, series in _by_kind(plot) for trail in series.trails for mark in trail if mark.label]
     out = []
-    for k, mark in sorted(labelled, key=lambda one: -one[1].weight):
+    for k, mark in sorted(labelled, key=lambda entry: -entry[1].weight):
         reach = (0, 6, 12, 20) if mark.weight >= FULL_WEIGHT else (0,)
         wide = len(mark.label) * LETTER_PX
         place = _free_position(_x(plot, mark.x), _y(plot, mark.y), wide, reach, taken, plot)

@@ -103,7 +103,7 @@ def _is_adopted(planned: PlannedCapture, store: CaptureStore) -> bool:
                 "Adopt it in the store of that device.",
             ) from error
         raise unknown_capture(planned.id) from error
-    return any(one.result == planned.result for one in versions)
+    return any(version.result == planned.result for version in versions)
 
 
 def _adopt(
@@ -149,7 +149,7 @@ def _shown(picture: Image, field_px: tuple[int, int, int, int]) -> Image:
 def _frames(planned: PlannedCapture) -> dict[str, str]:
     """Return the SHA-256 of the frames by the names that they have in a store."""
     found = {Path(planned.raw).name: planned.raw_sha256}
-    found |= {Path(one.path).name: one.sha256 for one in planned.frames}
+    found |= {Path(frame.path).name: frame.sha256 for frame in planned.frames}
     return found | ({Path(planned.dark).name: planned.dark_sha256} if planned.dark else {})
 
 

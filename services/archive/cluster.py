@@ -126,8 +126,8 @@ class CalibrationPlugin(WorkerPlugin):
 def send_calibration(client: Client, calibration: PlannedCalibration) -> None:
     """Send the files of a calibration to all workers; SettingError if they changed since the plan."""
     files = {}
-    for (_, name), one in zip(local_names(calibration), calibration.files, strict=True):
-        files[name] = _planned_content(Path(one.path), one.sha256)
+    for (_, name), file in zip(local_names(calibration), calibration.files, strict=True):
+        files[name] = _planned_content(Path(file.path), file.sha256)
     _retried(lambda: client.register_plugin(CalibrationPlugin(calibration.digest, files)))
 
 
@@ -163,8 +163,8 @@ def outcomes(client: Client, plan: Plan, names: Sequence[str], root: Path) -> It
 
     StoreFull or StoreError if results cannot be written, DiffuscopeError if the scheduler is lost.
     """
-    calibrations = {one.digest: one for one in plan.calibrations}
-    captures = {one.result: one for one in plan.captures}
+    calibrations = {calibration.digest: calibration for calibration in plan.calibrations}
+    captures = {capture.result: capture for capture in plan.captures}
     waiting = iter(names)
 
     def submit() -> Any | None:

@@ -29,8 +29,8 @@ def plan(
     settings = PlanSettings(method=method, rounds=rounds, budget_s=budget_s)
     made = make_plan(source, settings, SystemClock(), say)
     write_plan(made, output)
-    for one in made.left_out[:20]:
-        say(f"left out: {one.id}: {one.reason}")
+    for left_out in made.left_out[:20]:
+        say(f"left out: {left_out.id}: {left_out.reason}")
     if len(made.left_out) > 20:
         say(f"and {len(made.left_out) - 20} more, which the plan lists")
     counts = f"{len(made.captures)} captures with {len(made.calibrations)} calibrations"
@@ -84,8 +84,8 @@ def adopt(
     from services.archive.adopt import adopt_results  # deferred: imports SQLAlchemy, of the extra `instrument`
 
     done = adopt_results(folder, data, SystemClock(), say)
-    for one in done.refused[:20]:
-        say(f"refused: {one.id}: {one.reason}. {one.remedy}")
+    for refused in done.refused[:20]:
+        say(f"refused: {refused.id}: {refused.reason}. {refused.remedy}")
     if len(done.refused) > 20:
         say(f"and {len(done.refused) - 20} more")
     typer.echo(

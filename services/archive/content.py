@@ -63,7 +63,7 @@ def result_name(
     the equal name on every machine.
     """
     content = {
-        "frames": [list(one) for one in frames],
+        "frames": [list(frame) for frame in frames],
         "calibration": calibration,
         "software": dict(versions),
         "settings": settings,

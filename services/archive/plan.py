@@ -124,7 +124,7 @@ class Plan(_Part):
 
     def calibration(self, digest: str) -> PlannedCalibration:
         """Return the calibration with this digest; KeyError if the plan has none."""
-        return {one.digest: one for one in self.calibrations}[digest]
+        return {calibration.digest: calibration for calibration in self.calibrations}[digest]
 
 
 def encoded(plan: Plan) -> bytes:
@@ -158,17 +158,17 @@ def read_plan(path: Path) -> Plan:
 
 
 def _refuse_inconsistent(plan: Plan, path: Path, remedy: str) -> None:
-    known = {one.digest for one in plan.calibrations}
-    if lost := [one.id for one in plan.captures if one.calibration not in known]:
+    known = {calibration.digest for calibration in plan.calibrations}
+    if lost := [capture.id for capture in plan.captures if capture.calibration not in known]:
         raise SettingError(f"{path} has no calibration for {lost[0]}", remedy)
-    names = Counter(one.result for one in plan.captures)
+    names = Counter(capture.result for capture in plan.captures)
     if twice := [name for name, count in names.items() if count > 1]:
         raise SettingError(f"{path} plans the result {twice[0]} twice", remedy)
 
 
 def _without_empty(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_empty(one) for key, one in value.items() if one is not None and one != ""}
+        return {key: _without_empty(entry) for key, entry in value.items() if entry is not None and entry != ""}
     if isinstance(value, list | tuple):
-        return [_without_empty(one) for one in value]
+        return [_without_empty(entry) for entry in value]
     return value

@@ -94,8 +94,11 @@ class _Planning:
         calibration = self._calibration(found.calibration)
         raw_digest = found.raw_sha256 or file_digest(found.raw)
         dark_digest = "" if found.dark is None else found.dark_sha256 or file_digest(found.dark)
-        frames = tuple(_planned_frame(one) for one in found.frames)
-        content = [("raw", raw_digest, ""), *((one.colour or "burst", one.sha256, one.unusable) for one in frames)]
+        frames = tuple(_planned_frame(frame) for frame in found.frames)
+        content = [
+            ("raw", raw_digest, ""),
+            *((frame.colour or "burst", frame.sha256, frame.unusable) for frame in frames),
+        ]
         content += [("dark", dark_digest, "")] if found.dark is not None else []
         name = result_name(content, calibration.digest, software(), self._settings)
         if (same := self.captures.get(name)) is not None:
@@ -131,20 +134,20 @@ class _Planning:
         self.left_out.append(LeftOut(id=found.id, source=str(source), raw=str(found.raw), reason=reason))
 
 
-def _planned_frame(one: FoundFrame) -> PlannedFrame:
-    sha256 = one.sha256 or file_digest(one.path)
-    return PlannedFrame(path=str(one.path), sha256=sha256, colour=one.colour, unusable=one.unusable)
+def _planned_frame(frame: FoundFrame) -> PlannedFrame:
+    sha256 = frame.sha256 or file_digest(frame.path)
+    return PlannedFrame(path=str(frame.path), sha256=sha256, colour=frame.colour, unusable=frame.unusable)
 
 
 def _planned(found: FoundCalibration) -> PlannedCalibration:
     files = tuple(InputFile(role=role, path=str(path), sha256=file_digest(path)) for role, path in found.files)
-    digest = digest_of([(one.role, one.sha256) for one in files])
+    digest = digest_of([(file.role, file.sha256) for file in files])
     if found.archived is None:
         return PlannedCalibration(digest=digest, label=found.psfs[0].name, files=files)
-    kept = parse_calibration({Path(one.path).name: Path(one.path).read_bytes() for one in files})
+    kept = parse_calibration({Path(file.path).name: Path(file.path).read_bytes() for file in files})
     made_at = kept.provenance.made_at.isoformat()
     label = kept.provenance.serial
-    assert MANIFEST in {Path(one.path).name for one in files}
+    assert MANIFEST in {Path(file.path).name for file in files}
     return PlannedCalibration(digest=digest, label=label, files=files, id=found.archived.name, made_at=made_at)
 
 

@@ -92,7 +92,7 @@ def write_report(folder: Path, output: Path, progress: Callable[[str], None]) ->
     found = changes(columns)
     page = html(folder, columns, found)
     write_or_raise(output, lambda: atomic_io.write_atomically(output, page.encode(), mode=None))
-    losses = sum(one.is_loss for one in found)
+    losses = sum(change.is_loss for change in found)
     return f"{len(columns)} captures, {len(found)} compared with an earlier picture, {losses} got worse"
 
 
@@ -169,11 +169,11 @@ def _quality(found: list[Change]) -> str:
         return "<p>Nothing to compare: no capture has a figure before and after.</p>"
     rows = []
     for unit in ("dB", "cycles/px"):
-        some = [one for one in found if one.unit == unit]
+        some = [change for change in found if change.unit == unit]
         if some:
-            before = fmean(one.before for one in some)
-            after = fmean(one.after for one in some)
-            worse = sum(one.is_loss for one in some)
+            before = fmean(change.before for change in some)
+            after = fmean(change.after for change in some)
+            worse = sum(change.is_loss for change in some)
             name = "PSNR (dB)" if unit == "dB" else "cut-off frequency (cycles/px)"
             rows.append([name, str(len(some)), f"{before:.4g}", f"{after:.4g}", str(worse)])
     return _table(("figure", "captures", "mean before", "mean after", "worse"), rows) + _plot(found)
@@ -181,8 +181,8 @@ def _quality(found: list[Change]) -> str:
 
 def _plot(found: list[Change]) -> str:
     """Return the plot of the figure after against the figure before, of one unit, sampled evenly."""
-    unit = Counter(one.unit for one in found).most_common(1)[0][0]
-    points = [(one.before, one.after, one.id) for one in found if one.unit == unit]
+    unit = Counter(change.unit for change in found).most_common(1)[0][0]
+    points = [(change.before, change.after, change.id) for change in found if change.unit == unit]
     return _scatter("After against before", f"before ({unit})", f"after ({unit})", points)
 
 
@@ -191,9 +191,12 @@ def _scatter(title: str, x: str, y: str, points: Sequence[tuple[float, float, st
     if len(points) < 2:
         return ""
     points = points[:: max(1, len(points) // MAX_MARKS)]
-    trails = tuple((Mark(one, other, "", f"{label}: {one:.4g}, {other:.4g}", 0.5),) for one, other, label in points)
-    across = value_axis([one for one, _, _ in points], x)
-    up = value_axis([other for _, other, _ in points], y)
+    trails = tuple(
+        (Mark(x_value, y_value, "", f"{label}: {x_value:.4g}, {y_value:.4g}", 0.5),)
+        for x_value, y_value, label in points
+    )
+    across = value_axis([x_value for x_value, _, _ in points], x)
+    up = value_axis([y_value for _, y_value, _ in points], y)
     plot = Plot(title, "", f"{y} against {x}", across, up, (Series("capture", trails),), height=420)
     drawn = svg(plot)
     return _image("image/svg+xml", drawn.encode(), title)
@@ -204,14 +207,14 @@ def _image(kind: str, content: bytes, words: str) -> str:
 
 
 def _best(found: list[Change]) -> list[Change]:
-    ordered = sorted((one for one in found if one.gain > 0), key=lambda one: -one.gain)
+    ordered = sorted((change for change in found if change.gain > 0), key=lambda change: -change.gain)
     return ordered[:SHOWN]
 
 
 def _losses(folder: Path, columns: Columns, found: list[Change]) -> str:
     if not found:
         return "<p>Nothing to compare.</p>" + _least_explained(folder, columns)
-    losses = sorted((one for one in found if one.is_loss), key=lambda one: one.gain)
+    losses = sorted((change for change in found if change.is_loss), key=lambda change: change.gain)
     if not losses:
         return "<p>No capture got worse.</p>"
     words = f"<p>{len(losses)} captures got worse. The largest losses are shown.</p>"
@@ -238,15 +241,15 @@ def _least_explained(folder: Path, columns: Columns) -> str:
 def _pictures(folder: Path, columns: Columns, shown: Sequence[Change]) -> str:
     """Return the earlier and the new picture of captures, side by side, with figures and messages."""
     out = []
-    for one in shown:
-        place = columns.words("picture")[one.row]
-        messages = columns.values("messages")[one.row]
-        before = columns.words("before_picture")[one.row]
-        simulated = columns.values("simulated")[one.row] is not False
+    for change in shown:
+        place = columns.words("picture")[change.row]
+        messages = columns.values("messages")[change.row]
+        before = columns.words("before_picture")[change.row]
+        simulated = columns.values("simulated")[change.row] is not False
         pair = _thumbnail(Path(before) if before else None, simulated, "before")
         pair += _thumbnail(folder / place if place else None, simulated, "after")
         notes = "; ".join(map(str, messages)) if isinstance(messages, list) else ""
-        words = f"{one.id}: {one.before:.4g} to {one.after:.4g} {one.unit}. {notes}"
+        words = f"{change.id}: {change.before:.4g} to {change.after:.4g} {change.unit}. {notes}"
         out.append(f'<figure><div class="pair">{pair}</div><figcaption>{escape(words)}</figcaption></figure>')
     return "".join(out) or "<p>None.</p>"
 
@@ -283,12 +286,12 @@ def _causes(columns: Columns) -> str:
     ids = columns.words("id")
     found: dict[tuple[str, str], list[str]] = defaultdict(list)
     for id, many in zip(ids, columns.values("messages"), strict=True):
-        for one in many if isinstance(many, list) else ():
-            found["message", str(one)].append(id)
+        for message in many if isinstance(many, list) else ():
+            found["message", str(message)].append(id)
     for id, state, reason in zip(ids, columns.words("state"), columns.words("reason"), strict=True):
         if reason:
             found[state, reason].append(id)
-    ordered = sorted(found.items(), key=lambda one: -len(one[1]))[:40]
+    ordered = sorted(found.items(), key=lambda entry: -len(entry[1]))[:40]
     rows = [[kind, words, str(len(some)), ", ".join(some[:NAMED])] for (kind, words), some in ordered]
     head = ("kind", "words", "captures", f"the first {NAMED}")
     return _table(head, rows) if rows else "<p>No messages, and nothing in quarantine.</p>"
@@ -331,15 +334,17 @@ def _refraction(columns: Columns) -> str:
     known = [(sphere, sd) for sphere, sd in zip(spheres, sds, strict=True) if sphere is not None and sd is not None]
     if len(known) < 2:
         return "<p>Fewer than two captures have a refraction.</p>"
-    low, middle, high = quantiles([one for one, _ in known], n=4)
+    low, middle, high = quantiles([sphere_dpt for sphere_dpt, _ in known], n=4)
     words = f"<p>{len(known)} captures: median {middle:+.2f} dpt, quartiles {low:+.2f} and {high:+.2f} dpt; "
     words += f"median uncertainty (sd) {median(sd for _, sd in known):.2f} dpt.</p>"
-    return words + _scatter("Refraction", "sphere (dpt)", "sd (dpt)", [(one, sd, "") for one, sd in known])
+    return words + _scatter(
+        "Refraction", "sphere (dpt)", "sd (dpt)", [(sphere_dpt, sd, "") for sphere_dpt, sd in known]
+    )
 
 
 def _cost(columns: Columns) -> str:
-    totals = [one for one in columns.numbers("total_s") if one is not None]
-    solving = [one for one in columns.numbers("solve_s") if one is not None]
+    totals = [total_s for total_s in columns.numbers("total_s") if total_s is not None]
+    solving = [solve_s for solve_s in columns.numbers("solve_s") if solve_s is not None]
     if not totals:
         return "<p>Nothing was computed.</p>"
     workers = Counter(word for word in columns.words("worker") if word)

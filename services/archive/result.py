@@ -70,7 +70,7 @@ class Stored:
     @property
     def predicted(self) -> tuple[str, ...]:
         """Colours of the picture in colour that were not measured."""
-        return tuple(one.name for one in self.reconstruction.channels if one.predicted)
+        return tuple(channel.name for channel in self.reconstruction.channels if channel.predicted)
 
     @property
     def field_px(self) -> tuple[int, int, int, int]:
@@ -154,10 +154,10 @@ class ResultFolder:
         report, run = (_document(self.place(name) / file) for file in (REPORT, RUN))
         return Stored(report, run)
 
-    def quarantine(self, one: Quarantined) -> None:
+    def quarantine(self, failure: Quarantined) -> None:
         """Store why a capture has no result; OSError if the disk refuses."""
-        path = self._quarantine / f"{one.name}.json"
-        atomic_io.write_atomically(path, json.dumps(asdict(one), indent=1).encode(), mode=None)
+        path = self._quarantine / f"{failure.name}.json"
+        atomic_io.write_atomically(path, json.dumps(asdict(failure), indent=1).encode(), mode=None)
 
     def release(self, name: str) -> None:
         """Take a capture out of quarantine; no-op if it is not there."""

@@ -66,14 +66,14 @@ def _run(
     workers: int | None,
     scheduler: str | None,
 ) -> Ran:
-    kept = {one.name for one in results.quarantined() if not one.retry}
-    captures = sorted(plan.captures, key=lambda one: one.calibration)
-    names = [one.result for one in captures if one.result not in kept and not results.has(one.result)]
+    kept = {failure.name for failure in results.quarantined() if not failure.retry}
+    captures = sorted(plan.captures, key=lambda capture: capture.calibration)
+    names = [capture.result for capture in captures if capture.result not in kept and not results.has(capture.result)]
     begin_s = clock.now_s()
     if names:
         with cluster.connected(workers, scheduler) as client:
             cluster.refuse_other_versions(client)
-            used = {one.calibration for one in captures}
+            used = {capture.calibration for capture in captures}
             for calibration in plan.calibrations:
                 if calibration.digest in used:
                     cluster.send_calibration(client, calibration)
@@ -82,7 +82,7 @@ def _run(
             for outcome in cluster.outcomes(client, plan, names, results.root):
                 computing.take(outcome)
             computing.require_results()
-    done = sum(results.has(one.result) for one in captures)
+    done = sum(results.has(capture.result) for capture in captures)
     path = results.root / TABLE
     write_or_raise(path, lambda: write_table(plan, results))
     return Ran(done, len(captures) - done, len(plan.left_out), len(names), clock.now_s() - begin_s)
@@ -94,7 +94,7 @@ class _Computing:
     def __init__(
         self, plan: Plan, results: ResultFolder, count: int, clock: Clock, progress: Callable[[str], None]
     ) -> None:
-        self._planned = {one.result: one for one in plan.captures}
+        self._planned = {capture.result: capture for capture in plan.captures}
         self._results, self._count, self._clock, self._progress = results, count, clock, progress
         self._begin_s = self._shown_s = clock.now_s()
         self._ended = self._failed = 0

@@ -100,9 +100,9 @@ class CalibrationFiles:
 def local_names(calibration: PlannedCalibration) -> list[tuple[Role, str]]:
     """Return role and local name of each file of a calibration; that of an archive is ID/NAME, PSFs are numbered."""
     names: list[tuple[Role, str]] = []
-    for number, one in enumerate(calibration.files):
-        plain = Path(one.path).name
-        names.append((one.role, f"{calibration.id}/{plain}" if one.role == "archive" else f"{number}-{plain}"))
+    for number, file in enumerate(calibration.files):
+        plain = Path(file.path).name
+        names.append((file.role, f"{calibration.id}/{plain}" if file.role == "archive" else f"{number}-{plain}"))
     return names
 
 
@@ -193,12 +193,12 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
     lit = [_copied(capture.raw, capture.raw_sha256, spool / "raw")]
     colours = dict[Colour, list[Path]]()
     unusable = dict[int, str]()
-    for one in capture.frames:
-        copy = _copied(one.path, one.sha256, spool / "raw")
-        if one.colour:
-            colours.setdefault(one.colour, []).append(copy)
+    for frame in capture.frames:
+        copy = _copied(frame.path, frame.sha256, spool / "raw")
+        if frame.colour:
+            colours.setdefault(frame.colour, []).append(copy)
         else:
-            unusable |= {len(lit): one.unusable} if one.unusable else {}
+            unusable |= {len(lit): frame.unusable} if frame.unusable else {}
             lit.append(copy)
     dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
     return frames_of_capture(lit, colours, dark, unusable)
@@ -256,7 +256,7 @@ def _report(task: Task, made: _Made) -> dict[str, object]:
     report = asdict(solved.made.report)
     del report["seconds"]
     rows, cols = solved.made.picture.shape[:2]
-    (top, bottom, _), (left, right, _) = (one.indices(n) for one, n in zip(solved.box, (rows, cols), strict=True))
+    (top, bottom, _), (left, right, _) = (span.indices(n) for span, n in zip(solved.box, (rows, cols), strict=True))
     return {
         "capture": task.capture.model_dump(),
         "calibration": task.calibration.model_dump(),

@@ -167,7 +167,7 @@ def _stored(store: Path, place: Path, calibrations: Mapping[str, Path], unusable
         device=calibrations[id].parent.name if id in calibrations else "",
         origin=(report.device and report.device.uuid) or "",
     )
-    if gone := [path.name for path in (found.raw, *(one.path for one in found.frames)) if not path.is_file()]:
+    if gone := [path.name for path in (found.raw, *(frame.path for frame in found.frames)) if not path.is_file()]:
         return replace(found, refused=f"its raw frame {gone[0]} was removed")
     if id not in calibrations:
         return replace(found, refused=f"its calibration {id} is in no source; give the folder that holds it, too")
@@ -181,11 +181,11 @@ def _stored_frames(place: Path, digests: Mapping[str, str], report: CaptureRepor
     from services.instrument.capture import FRAME_QUALITY  # deferred: imports SQLAlchemy
 
     uses = report.frames
-    reasons = {one.index: one.reason for one in uses if one.reason and one.reason.startswith(FRAME_QUALITY)}
+    reasons = {use.index: use.reason for use in uses if use.reason and use.reason.startswith(FRAME_QUALITY)}
     named = {path.stem: path for path in (place / name for name in digests) if path.suffix == ".tiff"}
     return tuple(
-        replace(one, sha256=digests[one.path.name], unusable="" if one.colour else reasons.get(k, ""))
-        for k, one in enumerate(further_frames("raw", named), 1)
+        replace(frame, sha256=digests[frame.path.name], unusable="" if frame.colour else reasons.get(k, ""))
+        for k, frame in enumerate(further_frames("raw", named), 1)
     )
 
 
@@ -248,7 +248,7 @@ def _grouped(images: Mapping[str, Path]) -> dict[str, tuple[FoundFrame, ...]]:
     for stem in sorted(images):
         if images[stem] not in taken:
             groups[stem] = further_frames(stem, images)
-            taken |= {one.path for one in groups[stem]}
+            taken |= {frame.path for frame in groups[stem]}
     return groups
 
 
@@ -256,7 +256,7 @@ def _of_dataset(folder: Path) -> Iterator[FoundCapture]:
     """Yield the pairs of a data set; of scenes and own pairs, several frames of one name are one capture."""
     dataset = open_dataset(folder, split="all")
     own_layout = dataset.layout.name in ("pairs", "simulated")
-    images = {folder: _images(folder) for folder in {one.raw.parent for one in dataset.entries}}
+    images = {folder: _images(folder) for folder in {entry.raw.parent for entry in dataset.entries}}
     groups = {folder: _grouped(found) for folder, found in images.items()} if own_layout else {}
     for entry in dataset.entries:
         place = entry.raw.parent

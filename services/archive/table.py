@@ -122,8 +122,8 @@ def encoded_table(rows: Iterable[Row]) -> bytes:
 
 
 def _rows(plan: Plan, results: ResultFolder) -> Iterator[Row]:
-    failures = {one.name: one for one in results.quarantined()}
-    made_at = {one.digest: one.made_at for one in plan.calibrations}
+    failures = {failure.name: failure for failure in results.quarantined()}
+    made_at = {calibration.digest: calibration.made_at for calibration in plan.calibrations}
     settings = digest_of(plan.settings.model_dump())[:12]
     common: Row = {"settings": settings, "diffuscope": plan.software["diffuscope"], "software": plan.software["code"]}
     for capture in plan.captures:
@@ -132,8 +132,14 @@ def _rows(plan: Plan, results: ResultFolder) -> Iterator[Row]:
             yield row | _done_columns(results.read(capture.result), results, capture.result)
         else:
             yield row | _failed_columns(failures.get(capture.result))
-    for one in plan.left_out:
-        yield common | {"id": one.id, "source": one.source, "raw": one.raw, "state": "left out", "reason": one.reason}
+    for left_out in plan.left_out:
+        yield common | {
+            "id": left_out.id,
+            "source": left_out.source,
+            "raw": left_out.raw,
+            "state": "left out",
+            "reason": left_out.reason,
+        }
 
 
 def planned_columns(capture: PlannedCapture, made_at: str) -> Row:
@@ -149,10 +155,10 @@ def age_days(made_at: str, taken_at: str) -> float | None:
     if not (made_at and taken_at):
         return None
     try:
-        first, second = (datetime.fromisoformat(one) for one in (made_at, taken_at))
+        first, second = (datetime.fromisoformat(text) for text in (made_at, taken_at))
     except ValueError:
         return None
-    first, second = (one if one.tzinfo else one.replace(tzinfo=UTC) for one in (first, second))
+    first, second = (time if time.tzinfo else time.replace(tzinfo=UTC) for time in (first, second))
     return (second - first).total_seconds() / 86400
 
 
@@ -167,7 +173,9 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     document = stored.report
     run = stored.run
     report = stored.reconstruction
-    raw, scores, seconds = (_object(one) for one in (document.get("raw"), document.get("scores"), run.get("seconds")))
+    raw, scores, seconds = (
+        _object(entry) for entry in (document.get("raw"), document.get("scores"), run.get("seconds"))
+    )
     dpt = report.refraction_dpt or {}
     place = results.place(name)
     colour = place / COLOUR_PICTURE
@@ -199,13 +207,13 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
 
 def _frame_columns(report: CaptureReport) -> Row:
     """Return how many frames were taken and used, and the colours that are measured, predicted and missing."""
-    taken = [one for one in report.channels if one.reason is None]
+    taken = [channel for channel in report.channels if channel.reason is None]
     return {
         "frames": len(report.frames),
-        "frames_used": sum(one.used for one in report.frames),
-        "channels": [one.name for one in taken if not one.predicted],
-        "predicted_channels": [one.name for one in taken if one.predicted],
-        "missing_channels": [one.name for one in report.channels if one.reason is not None],
+        "frames_used": sum(frame.used for frame in report.frames),
+        "channels": [channel.name for channel in taken if not channel.predicted],
+        "predicted_channels": [channel.name for channel in taken if channel.predicted],
+        "missing_channels": [channel.name for channel in report.channels if channel.reason is not None],
     }
 
 

@@ -97,15 +97,15 @@ def battery_alerts(charge_ratio: float, least_ratio: float) -> Iterator[Alert]:
 
 def calibration_alerts(findings: Sequence[Finding]) -> Iterator[Alert]:
     """Return the alert `cal.old` with the age in weeks, if a finding is the age warning."""
-    yield from (Alert("cal.old", n=int(one.value)) for one in findings if is_age_warning(one))
+    yield from (Alert("cal.old", n=int(finding.value)) for finding in findings if is_age_warning(finding))
 
 
-def is_age_warning(one: Finding) -> bool:
+def is_age_warning(finding: Finding) -> bool:
     """Return whether a finding is the hint that the calibration is old but may still be used (alert `cal.old`).
 
     False for an expired calibration, and for one whose date is in the future.
     """
-    return one.name == "age" and one.hint and one.limit > 0
+    return finding.name == "age" and finding.hint and finding.limit > 0
 
 
 def date_alerts(now: datetime, newest: datetime | None, drift_s: float, is_synchronised: bool) -> Iterator[Alert]:

@@ -155,8 +155,8 @@ ORPHANS_REMEDY = (
 DAMAGED_REMEDY = "What has such an entry is not listed. Its pictures stay on the disk. Call the technician."
 
 
-def _count(number: int, one: str, more: str) -> str:
-    return f"{number} {one if number == 1 else more}"
+def _count(number: int, singular: str, plural: str) -> str:
+    return f"{number} {singular if number == 1 else plural}"
 
 
 def space(facts: StatusSnapshot) -> Check:

@@ -49,7 +49,11 @@ def collect_status(
         now=clock.wall(),
         clock=clock_state(),
         newest=newest[0].taken_at if newest else None,
-        presses=[(spent_s, spent_s - one.report.budget_s) for one in newest if (spent_s := one.report.total_s) > 0],
+        presses=[
+            (spent_s, spent_s - capture.report.budget_s)
+            for capture in newest
+            if (spent_s := capture.report.total_s) > 0
+        ],
         unsent=unsent,
         torn_bytes=list(store.quarantine.sizes_bytes().values()),
         orphans=orphans,

@@ -41,7 +41,7 @@ class DoctorReport(BaseModel):
     @property
     def healthy(self) -> bool:
         """Whether no check failed; warnings do not count."""
-        return all(one.state != "failed" for one in self.findings)
+        return all(finding.state != "failed" for finding in self.findings)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Machine:
 
     def is_set(self, line: str) -> bool:
         """Return whether config.txt has this line, such as dtparam=spi=on."""
-        return line in [one.split("#")[0].strip() for one in (self.text(CONFIG) or "").splitlines()]
+        return line in [entry.split("#")[0].strip() for entry in (self.text(CONFIG) or "").splitlines()]
 
 
 Check = Callable[[Machine, InstrumentSpec | None], Iterator[DoctorFinding]]
@@ -161,10 +161,10 @@ def examine(machine: Machine, spec: InstrumentSpec | None, checks: tuple[Check, 
 def table(report: DoctorReport) -> str:
     """Return the report as text: one line per check, and its remedy below it."""
     lines = []
-    for one in report.findings:
-        lines.append(f"{one.state:<8} {one.check:<18} {one.reading}")
-        if one.remedy:
-            lines.append(f"{'':<28}{one.remedy}")
+    for finding in report.findings:
+        lines.append(f"{finding.state:<8} {finding.check:<18} {finding.reading}")
+        if finding.remedy:
+            lines.append(f"{'':<28}{finding.remedy}")
     return "\n".join(lines)
 
 

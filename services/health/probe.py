@@ -94,7 +94,7 @@ def probe_instrument(base_url: str = BASE_URL, with_picture: bool = False, timeo
 
 def _instrument_checks(at: str, patience_s: float) -> list[Check]:
     try:
-        return [Check(**one) for one in json.loads(http_get(at, "/api/health", patience_s)[1])["checks"]]
+        return [Check(**fields) for fields in json.loads(http_get(at, "/api/health", patience_s)[1])["checks"]]
     except (httpx.HTTPError, ValueError, KeyError, TypeError) as error:
         return [Check("checks", False, f"cannot be read: {error}", "a list", RESTART_REMEDY, True)]
 

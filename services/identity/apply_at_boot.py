@@ -79,7 +79,7 @@ class Computer:
             return
         subprocess.run(["umount", "-q", file], check=False)  # systemd mounts its random id over the file
         file.write_text(f"{machine_id}\n")
-        early, ours = (self.root / "run/log/journal" / one for one in (random_id, machine_id))
+        early, ours = (self.root / "run/log/journal" / name for name in (random_id, machine_id))
         ours.mkdir(parents=True, exist_ok=True)
         for number, written in enumerate(sorted(early.glob("*.journal"))):
             written.rename(ours / f"early-{number}.journal")  # the following flush includes it

@@ -45,7 +45,7 @@ class CardBoot:
         Each step is tried, whatever another one raised, and the device starts: the first problem is published.
         """
         problems = [_attempt(step) for step in (self._take, self._apply, self._apply_update_settings)]
-        problem = next((one for one in problems if one is not None), None)
+        problem = next((error for error in problems if error is not None), None)
         self._publish(problem)
         return problem
 
@@ -61,7 +61,7 @@ class CardBoot:
         settings = kept_settings(self.kept)
         steps = (self._apply_head_and_programme, self._apply_place, self._apply_networks, self._apply_ssh)
         problems = [_attempt(partial(step, settings)) for step in steps]
-        return next((one for one in problems if one is not None), None)
+        return next((error for error in problems if error is not None), None)
 
     def _apply_head_and_programme(self, settings: CardSettings) -> None:
         output = self.root / OUTPUT

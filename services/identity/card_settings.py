@@ -181,9 +181,9 @@ def named_files(settings: CardSettings, folder: Path) -> list[str]:
 def _texts(value: object) -> list[str]:
     """Return every text among the values of a TOML table."""
     if isinstance(value, dict):
-        return [text for one in value.values() for text in _texts(one)]
+        return [text for entry in value.values() for text in _texts(entry)]
     if isinstance(value, list):
-        return [text for one in value for text in _texts(one)]
+        return [text for entry in value for text in _texts(entry)]
     return [value] if isinstance(value, str) else []
 
 

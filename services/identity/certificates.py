@@ -28,7 +28,7 @@ def create_authority(name: str, clock: Clock) -> tuple[bytes, bytes]:
     permitted = [
         x509.DNSName(SHARED_HOST_NAME),
         x509.DNSName(f"{name}.local"),
-        *(x509.IPAddress(one) for one in NETWORKS),
+        *(x509.IPAddress(network) for network in NETWORKS),
     ]
     subject = _distinguished_name(f"{name} made {clock.wall():%Y-%m-%d}")
     certificate = (

@@ -45,7 +45,7 @@ def read_metadata(entries: Mapping[str, object]) -> RawMetadata:
     eye = entries.get("eye")
     return RawMetadata(
         id=_text(entries.get("id")),
-        eye=next((one for one in EYES if one == eye), None),
+        eye=next((name for name in EYES if name == eye), None),
         taken_at=_time(entries.get("taken_at")),
         exposure_s=_number(entries.get("exposure_s")),
         illumination=_illumination(entries.get("illumination")),
@@ -74,6 +74,6 @@ def _illumination(value: object) -> Illumination | None:
     if not isinstance(value, Mapping):
         return None
     colours: tuple[Colour, ...] = get_args(Colour)
-    colour = next((one for one in colours if one == value.get("colour")), None)
+    colour = next((name for name in colours if name == value.get("colour")), None)
     level = _number(value.get("level"))
     return Illumination(colour, level) if colour is not None and level is not None and 0 < level <= 1 else None

@@ -208,8 +208,8 @@ class _Run:
                 self.leave_out(pair.name, "LenslessPiCam", error, progress)
                 return
             yield from (
-                Made(one.name, 1, rounds, one.seconds, one.picture)
-                for rounds, one in zip(self.peer.rounds, pictures, strict=True)
+                Made(result.name, 1, rounds, result.seconds, result.picture)
+                for rounds, result in zip(self.peer.rounds, pictures, strict=True)
             )
 
     def _ours(self, pair: Pair, calibration: Calibration, recipe: Recipe) -> Made:
@@ -240,8 +240,8 @@ class _Run:
         return kept
 
 
-def _equal(one: Calibration, other: Calibration) -> bool:
+def _equal(first: Calibration, second: Calibration) -> bool:
     """Return whether two calibrations of a data set share PSF (read once), sensor and bad pixels."""
-    assert one.bad is not None
-    assert other.bad is not None
-    return one.psfs[0] is other.psfs[0] and one.sensor == other.sensor and np.array_equal(one.bad, other.bad)
+    assert first.bad is not None
+    assert second.bad is not None
+    return first.psfs[0] is second.psfs[0] and first.sensor == second.sensor and np.array_equal(first.bad, second.bad)

@@ -28,25 +28,25 @@ STACK_REMEDY = "Give a stack of PSFs as --psf A --psf B, or as --psf FOLDER; giv
 def refuse_repeated(loaded: Sequence[LoadedRaw]) -> None:
     """Raise FrameError if two raws of a burst hold the same pixels: the noise of two exposures differs."""
     seen: dict[str, str] = {}
-    for one in loaded:
-        pixels = one.raw.pixels
+    for frame in loaded:
+        pixels = frame.raw.pixels
         digest = f"{pixels.dtype} {sha256(pixels.tobytes()).hexdigest()}"
         if digest in seen:
             raise FrameError(
-                f"{one.name} holds the same pixels as {seen[digest]}, so it is no second exposure",
+                f"{frame.name} holds the same pixels as {seen[digest]}, so it is no second exposure",
                 "Give each frame of a burst once; one frame is solved alone.",
             )
-        seen[digest] = one.name
+        seen[digest] = frame.name
 
 
 def refuse_psfs(usable: Sequence[LoadedRaw], psfs: Sequence[Psf]) -> None:
     """Raise FrameError for the first frame with the spectrum of a PSF: it shows a point, and no object."""
     if min(psfs[0].pixels.shape) < 2 * HIGH[1]:
         return  # too few samples for these frequencies
-    least = PSF_LIKE * min(_fall(one.pixels) for one in psfs)
-    for one in usable:
-        if _fall(_grey(one)) > least:
-            raise FrameError(f"{one.name} looks like a PSF, not like a frame of a burst", STACK_REMEDY)
+    least = PSF_LIKE * min(_fall(psf.pixels) for psf in psfs)
+    for frame in usable:
+        if _fall(_grey(frame)) > least:
+            raise FrameError(f"{frame.name} looks like a PSF, not like a frame of a burst", STACK_REMEDY)
 
 
 def _fall(image: Image) -> float:
@@ -79,9 +79,9 @@ def _grey(loaded: LoadedRaw) -> Image:
 def unusable_raws(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
     """Return the reason of each raw that holds no usable signal, by its place in the burst."""
     reasons = {}
-    for k, one in enumerate(loaded):
+    for k, frame in enumerate(loaded):
         try:
-            refuse_without_signal(one.raw, one.label)
+            refuse_without_signal(frame.raw, frame.label)
         except FrameError as error:
             reasons[k] = error.message
     return reasons
@@ -98,22 +98,22 @@ def common_raw(usable: Sequence[LoadedRaw]) -> LoadedRaw:
             "the raws of a burst have one channel, and these have three",
             "Give the raws of each colour with its PSF: --channel NAME RAW PSF.",
         )
-    for one in usable[1:]:
-        refuse_other_size(one, first)
-        if _storage(one) != _storage(first):
+    for frame in usable[1:]:
+        refuse_other_size(frame, first)
+        if _storage(frame) != _storage(first):
             raise FrameError(
-                f"{one.name} is stored in another way than {first.name}: other levels, or other types of numbers",
+                f"{frame.name} is stored in another way than {first.name}: other levels, or other types of numbers",
                 "Give the raws of one burst, saved in one format.",
             )
-    white_dn = common_white_dn([one.raw for one in usable])
+    white_dn = common_white_dn([frame.raw for frame in usable])
     return replace(first, raw=replace(first.raw, white_dn=white_dn, bad=np.zeros(first.solved_shape, np.bool_)))
 
 
-def refuse_other_size(one: LoadedRaw, first: LoadedRaw) -> None:
+def refuse_other_size(frame: LoadedRaw, first: LoadedRaw) -> None:
     """Raise FrameError for a frame with another size, or number of channels, than the first of its capture."""
-    if (one.shape, one.channels) != (first.shape, first.channels):
+    if (frame.shape, frame.channels) != (first.shape, first.channels):
         raise FrameError(
-            f"{one.name} has {_size(one)}, {first.name} {_size(first)}",
+            f"{frame.name} has {_size(frame)}, {first.name} {_size(first)}",
             "Give the raws of one capture, in one and the same camera mode.",
         )
 
@@ -132,7 +132,7 @@ def without_bad(raw: Raw) -> Pixels:
 def rejections(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> tuple[str, ...]:
     """Return a note for each raw that is not used."""
     return tuple(
-        f"{one.label} was left out: {use.reason}." for one, use in zip(loaded, frames, strict=True) if not use.used
+        f"{frame.label} was left out: {use.reason}." for frame, use in zip(loaded, frames, strict=True) if not use.used
     )
 
 

@@ -26,7 +26,7 @@ class ReconstructCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Join the values of each `--channel` to one, then parse as every command does."""
         joined = _joined(args)
-        refuse_stray(joined, {name for one in self.params if _takes_value(one) for name in one.opts})
+        refuse_stray(joined, {name for parameter in self.params if _takes_value(parameter) for name in parameter.opts})
         return super().parse_args(ctx, joined)
 
 

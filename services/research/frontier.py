@@ -152,7 +152,7 @@ def selected_methods(names: Sequence[str]) -> Mapping[str, Method]:
 
     SettingError for an unknown method.
     """
-    return {one.name: one for one in map(find_method, names)} or available_methods()
+    return {method.name: method for method in map(find_method, names)} or available_methods()
 
 
 def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer | None) -> Frontier:
@@ -224,12 +224,12 @@ def table(found: Frontier) -> str:
     )
     for peer in found.peers:
         lines.append(f"  {peer.name}: {peer.psnr_db:.2f} dB in {peer.seconds:.3f} s")
-    for one in found.light:
+    for burst in found.light:
         lines.append(
-            f"  {one.length} ({one.used} used), {one.dose_j_per_cm2:.2g} J/cm2: {one.psnr_db:.2f} dB in "
-            f"{one.seconds_median:.3f} s; linear bound {one.bound_psnr_db:.2f} dB"
+            f"  {burst.length} ({burst.used} used), {burst.dose_j_per_cm2:.2g} J/cm2: {burst.psnr_db:.2f} dB in "
+            f"{burst.seconds_median:.3f} s; linear bound {burst.bound_psnr_db:.2f} dB"
         )
-    return "\n".join([*lines, *(f"left out: {one}" for one in found.left_out)])
+    return "\n".join([*lines, *(f"left out: {left_out}" for left_out in found.left_out)])
 
 
 class _Bench:
@@ -260,7 +260,11 @@ class _Bench:
         key = recipe.method, recipe.bin
         if key not in self.makers:
             self.progress(f"{self.case.name}: planning {recipe.method}, bin {recipe.bin}")
-            rounds = [one.rounds for one in self.recipes if (one.method, one.bin) == key and one.rounds is not None]
+            rounds = [
+                candidate.rounds
+                for candidate in self.recipes
+                if (candidate.method, candidate.bin) == key and candidate.rounds is not None
+            ]
             most = Recipe(*key, max(rounds, default=None))
             self.makers[key] = Reconstructor(
                 self.case.calibration,
@@ -328,7 +332,9 @@ class _Bench:
         shown = []
         for p in nearest_points(drawn_points(found), choice.seconds_median):
             recipe = next(
-                one for one in self.recipes if (one.method, one.bin, one.rounds or 0) == (p.method, p.bin, p.rounds)
+                candidate
+                for candidate in self.recipes
+                if (candidate.method, candidate.bin, candidate.rounds or 0) == (p.method, p.bin, p.rounds)
             )
             lines = _label(p, self.methods)
             shown.append(Shown(lines, self.moved(_grey(self._reconstruct(recipe).picture))))
@@ -348,10 +354,10 @@ class _Bench:
     def peer_points(self, peer: LenslessPeer) -> tuple[PeerPoint, ...]:
         """Return the pictures of a peer, scored as ours are."""
         found = []
-        for one in peer(self.case.counts, self.case.calibration.psfs[0].pixels):
-            scores = self.judge(self.moved(_grey(one.picture)))
-            self.progress(f"{one.name}: {one.seconds:.3f} s, {scores.psnr_db:.2f} dB")
-            found.append(PeerPoint(one.name, one.seconds, scores.pcc, scores.psnr_db, scores.ssim))
+        for result in peer(self.case.counts, self.case.calibration.psfs[0].pixels):
+            scores = self.judge(self.moved(_grey(result.picture)))
+            self.progress(f"{result.name}: {result.seconds:.3f} s, {scores.psnr_db:.2f} dB")
+            found.append(PeerPoint(result.name, result.seconds, scores.pcc, scores.psnr_db, scores.ssim))
         return tuple(found)
 
     def measure(self, budget_s: float, repeats: int) -> tuple[tuple[Point, ...], Choice]:

@@ -81,7 +81,7 @@ def measure_light(
             made = last
         scores = judge(made.picture)
         bound = linear_bound(instrument.calibration, case.mean_dn, n, truth)
-        used = sum(one.used for one in made.report.frames) if n > 1 else 1
+        used = sum(frame.used for frame in made.report.frames) if n > 1 else 1
         point = LightPoint(
             n,
             used,

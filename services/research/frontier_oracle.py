@@ -45,7 +45,7 @@ def best_mus(
     for n in bins:
         seconds: list[float] = []
         pictures = ((mu, moved(picture)) for mu, picture in _pictures(counts, calibration, planner, n, clock, seconds))
-        mu, picture = max(pictures, key=lambda one: float(np.corrcoef(one[1][inside], truth[inside])[0, 1]))
+        mu, picture = max(pictures, key=lambda candidate: float(np.corrcoef(candidate[1][inside], truth[inside])[0, 1]))
         found.append(BestMu("tikhonov", n, mu, float(np.median(seconds)), **asdict(score(picture))))
     return tuple(found)
 

@@ -175,9 +175,9 @@ class _Measured:
         """Yield the scores of the peer in the region and at the shift of the methods."""
         judge = PairScorer(self.case.truth, scored_region(self.case)[0], shift)
         pictures = peer(without_bad_pixels(self.pair), self.case.calibration.psfs[0].pixels)
-        for rounds, one in zip(peer.rounds, pictures, strict=True):
-            score = PairScore(self.pair.name, one.name, 1, rounds, one.seconds, *judge(one.picture))
-            progress(f"  {one.name}: {one.seconds:.3f} s, {score.psnr_db:.2f} dB")
+        for rounds, result in zip(peer.rounds, pictures, strict=True):
+            score = PairScore(self.pair.name, result.name, 1, rounds, result.seconds, *judge(result.picture))
+            progress(f"  {result.name}: {result.seconds:.3f} s, {score.psnr_db:.2f} dB")
             yield score
 
 
@@ -199,9 +199,9 @@ def mean_frontier(found: DatasetFrontier) -> Frontier:
 
     The choice is that of the pair with the median PSNR.
     """
-    common = set.intersection(*({_key(p) for p in one.points} for one in found.frontiers))
+    common = set.intersection(*({_key(p) for p in frontier.points} for frontier in found.frontiers))
     groups = {
-        key: [p for one in found.frontiers for p in one.points if _key(p) == key]
+        key: [p for frontier in found.frontiers for p in frontier.points if _key(p) == key]
         for key in dict.fromkeys(map(_key, found.frontiers[0].points))
         if key in common
     }
@@ -215,7 +215,7 @@ def mean_frontier(found: DatasetFrontier) -> Frontier:
         scene=f"{found.data_set}, {len(found.frontiers)} pairs",
         points=tuple(points),
         best_mu=(),
-        choice=_median_choice([one.choice for one in found.frontiers]),
+        choice=_median_choice([frontier.choice for frontier in found.frontiers]),
         dominated=tuple(name for name in dict.fromkeys(p.method for p in points) if name not in kept),
     )
 

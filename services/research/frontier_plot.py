@@ -62,7 +62,7 @@ def _time_plot(
         *_peers(found),
         *_bursts_in_time(found),
     )
-    marks = [mark for one in series for trail in one.trails for mark in trail]
+    marks = [mark for curve in series for trail in curve.trails for mark in trail]
     y = value_axis([mark.y for mark in marks], "accuracy: PSNR in dB after an affine intensity fit")
     return Plot(
         title=f"Accuracy against time{' and light' if found.light else ''}: {found.scene}",
@@ -93,14 +93,14 @@ def _best_mus(found: Frontier) -> tuple[Series, ...]:
     """Return the paper's method by the paper's rule: the best mu of its range, chosen by the truth."""
     marks = tuple(
         Mark(
-            one.seconds_median,
-            one.psnr_db,
-            f"bin {one.bin}",
-            f"tikhonov with mu {one.mu:.0e}, the best of the paper's range, bin {one.bin}: "
-            f"{one.seconds_median * 1e3:.1f} ms, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}",
+            best.seconds_median,
+            best.psnr_db,
+            f"bin {best.bin}",
+            f"tikhonov with mu {best.mu:.0e}, the best of the paper's range, bin {best.bin}: "
+            f"{best.seconds_median * 1e3:.1f} ms, {best.psnr_db:.2f} dB, PCC {best.pcc:.3f}",
             0.95,
         )
-        for one in found.best_mu
+        for best in found.best_mu
     )
     return (Series("tikhonov, best mu", (marks,), 0),) if marks else ()
 
@@ -121,16 +121,16 @@ def _light_plot(found: Frontier) -> Plot:
     """Return accuracy against the dose: bursts, and the bound of a linear filter with as much light."""
     bursts = []
     bounds = []
-    for one in found.light:
-        dose_uj_per_cm2 = one.dose_j_per_cm2 * 1e6
-        words = one.length
-        spent = f"{words}, {dose_uj_per_cm2:.3g} uJ/cm2: {one.seconds_median * 1e3:.0f} ms"
-        label = f"{words} in {one.seconds_median:.2g} s"
-        bursts.append(Mark(dose_uj_per_cm2, one.psnr_db, label, f"{spent}, {one.psnr_db:.2f} dB"))
-        bound = f"{spent}, linear bound {one.bound_psnr_db:.2f} dB"
-        bounds.append(Mark(dose_uj_per_cm2, one.bound_psnr_db, "", bound, 0.7))
-    doses = [one.x for one in bursts]
-    worths = [one.y for one in bursts + bounds]
+    for burst in found.light:
+        dose_uj_per_cm2 = burst.dose_j_per_cm2 * 1e6
+        words = burst.length
+        spent = f"{words}, {dose_uj_per_cm2:.3g} uJ/cm2: {burst.seconds_median * 1e3:.0f} ms"
+        label = f"{words} in {burst.seconds_median:.2g} s"
+        bursts.append(Mark(dose_uj_per_cm2, burst.psnr_db, label, f"{spent}, {burst.psnr_db:.2f} dB"))
+        bound = f"{spent}, linear bound {burst.bound_psnr_db:.2f} dB"
+        bounds.append(Mark(dose_uj_per_cm2, burst.bound_psnr_db, "", bound, 0.7))
+    doses = [mark.x for mark in bursts]
+    worths = [mark.y for mark in bursts + bounds]
     y = value_axis(worths, "PSNR in dB", 0.15)
     return Plot(
         title="What more light buys",
@@ -163,9 +163,9 @@ def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
     choice = found.choice
     best = ", ".join(f"{value:.1f} dB in {seconds * 1e3:.0f} ms" for seconds, value in edge)
     bursts = ", ".join(
-        f"{one.length} {one.psnr_db:.1f} dB (linear bound {one.bound_psnr_db:.1f}) for "
-        f"{one.dose_j_per_cm2 * 1e6:.3g} uJ/cm2"
-        for one in found.light
+        f"{burst.length} {burst.psnr_db:.1f} dB (linear bound {burst.bound_psnr_db:.1f}) for "
+        f"{burst.dose_j_per_cm2 * 1e6:.3g} uJ/cm2"
+        for burst in found.light
     )
     return (
         f"Each mark is one method at one bin and one number of rounds: its median time, and its PSNR against the known "
@@ -200,13 +200,13 @@ def _peers(found: Frontier) -> tuple[Series, ...]:
     """Return the marks of other people's solvers."""
     marks = tuple(
         Mark(
-            one.seconds,
-            one.psnr_db,
-            one.name.split(", ")[-1].removesuffix(" rounds"),
-            f"{one.name}: {one.seconds:.2f} s, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}",
+            peer.seconds,
+            peer.psnr_db,
+            peer.name.split(", ")[-1].removesuffix(" rounds"),
+            f"{peer.name}: {peer.seconds:.2f} s, {peer.psnr_db:.2f} dB, PCC {peer.pcc:.3f}",
             0.9,
         )
-        for one in found.peers
+        for peer in found.peers
     )
     return (Series("LenslessPiCam", (marks,), PEER_KIND),) if marks else ()
 
@@ -215,12 +215,12 @@ def _bursts_in_time(found: Frontier) -> tuple[Series, ...]:
     """Return the bursts at their times, refraction included."""
     marks = tuple(
         Mark(
-            one.seconds_median,
-            one.psnr_db,
-            one.length,
-            f"{one.length}: {one.seconds_median * 1e3:.0f} ms, {one.psnr_db:.2f} dB",
+            burst.seconds_median,
+            burst.psnr_db,
+            burst.length,
+            f"{burst.length}: {burst.seconds_median * 1e3:.0f} ms, {burst.psnr_db:.2f} dB",
         )
-        for one in found.light
+        for burst in found.light
     )
     return (Series("burst", (marks,), BURST_KIND),) if marks else ()
 

@@ -52,12 +52,14 @@ def thumbnail_panel(shown: Sequence[Shown], truth: Image, inside: Mask, simulate
     """
     true = np.nan_to_num(np.asarray(truth, np.float64))
     place = detailed_place(true, inside)
-    fitted = [fit_intensity(np.asarray(one.picture, np.float64), true, inside)[place] for one in shown]
+    fitted = [fit_intensity(np.asarray(thumbnail.picture, np.float64), true, inside)[place] for thumbnail in shown]
     wanted = true[place]
     low, high = np.quantile(wanted, (0.002, 0.998))
     seen, spots = visible_spots(fitted, wanted)
     elements = [text(LEFT, 20, "The same place in these pictures and in the truth", "small")]
-    for k, (lines, crop) in enumerate(zip([*(one.lines for one in shown), ("truth",)], [*fitted, wanted], strict=True)):
+    for k, (lines, crop) in enumerate(
+        zip([*(thumbnail.lines for thumbnail in shown), ("truth",)], [*fitted, wanted], strict=True)
+    ):
         letter = f"{LETTERS[k]}: " if k < len(shown) else ""
         elements += _thumbnail(LEFT + k * PITCH_PX, (letter + lines[0], *lines[1:]), _png(crop, low, high, simulated))
     each = ", ".join(f"{letter} {count}" for letter, count in zip(LETTERS, seen, strict=False))

@@ -58,16 +58,16 @@ def _tables(path: str, kind: type[Table]) -> Iterator[tuple[str, type[Table]]]:
 def _models(annotation: Any) -> list[type[Table]]:
     if isinstance(annotation, type) and issubclass(annotation, Table):
         return [annotation]
-    return [model for one in get_args(annotation) for model in _models(one)]
+    return [model for argument in get_args(annotation) for model in _models(argument)]
 
 
 def _section(path: str, kind: type[Table]) -> str:
     """Return the heading of a table, what it is, and a row for each of its keys."""
     meanings = dict(re.findall(r"^    (\w+): .*?  # (.+)$", inspect.getsource(kind), re.M))
-    keys = {name: one for name, one in kind.model_fields.items() if not _models(one.annotation)}
+    keys = {name: key for name, key in kind.model_fields.items() if not _models(key.annotation)}
     rows = [
-        f"| `{name}` | {_kind(one.annotation)} | {_default(one)} | {_range(one)} | {meanings.get(name, '')} |"
-        for name, one in keys.items()
+        f"| `{name}` | {_kind(key.annotation)} | {_default(key)} | {_range(key)} | {meanings.get(name, '')} |"
+        for name, key in keys.items()
     ]
     heading = f"## `[{path}]`" if path else "## At the top"
     words = inspect.getdoc(kind) or ""
@@ -78,13 +78,15 @@ def _section(path: str, kind: type[Table]) -> str:
 def _kind(annotation: Any) -> str:
     """Return the values of a key in words; its choices, if it has single ones."""
     if get_origin(annotation) is Literal:
-        return ", ".join(f"`{_toml(one)}`" for one in get_args(annotation))
+        return ", ".join(f"`{_toml(choice)}`" for choice in get_args(annotation))
     if annotation in NAMES or get_origin(annotation) is dict:
         return NAMES[get_origin(annotation) or annotation]
     inner = get_args(annotation)
     if get_origin(annotation) is tuple:
         return f"list of {_kind(inner[0])}" if inner[-1] is ... else f"{len(inner)} values: {_kind(inner[0])}"
-    return " or ".join(dict.fromkeys(_kind(one) for one in inner if one is not type(None) and _is_kind(one)))
+    return " or ".join(
+        dict.fromkeys(_kind(member) for member in inner if member is not type(None) and _is_kind(member))
+    )
 
 
 def _is_kind(annotation: Any) -> bool:
@@ -108,7 +110,7 @@ def _toml(value: Any) -> str:
 
 
 def _range(key: FieldInfo) -> str:
-    bounds = {type(one): one for one in key.metadata if type(one) in BOUNDS}
+    bounds = {type(bound): bound for bound in key.metadata if type(bound) in BOUNDS}
     return ", ".join(
         BOUNDS[kind].format(f"{getattr(bounds[kind], kind.__name__.lower()):g}") for kind in BOUNDS if kind in bounds
     )

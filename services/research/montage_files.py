@@ -46,7 +46,7 @@ def montage_files(
     write_picture(output, joined.picture, simulated)
     if report is not None:
         entries = {
-            "placed": [asdict(one) for one in joined.placed],
+            "placed": [asdict(place) for place in joined.placed],
             "origin_px": joined.origin_px,
             "projection": joined.projection,
             "px_per_deg": joined.px_per_deg,
@@ -86,15 +86,15 @@ def read_picture(path: Path) -> Image:
 def placed_lines(joined: Montage, pictures: Sequence[Path]) -> list[str]:
     """Return a line for each picture: its place, or why it has none."""
     lines = []
-    for path, one in zip(pictures, joined.placed, strict=True):
-        if one.shift_px is None or one.rotation_deg is None:
-            lines.append(f"{path}: not used: {one.reason}")
-        elif one.peak is None:
+    for path, place in zip(pictures, joined.placed, strict=True):
+        if place.shift_px is None or place.rotation_deg is None:
+            lines.append(f"{path}: not used: {place.reason}")
+        elif place.peak is None:
             lines.append(f"{path}: the reference")
         else:
-            down, right = one.shift_px
+            down, right = place.shift_px
             lines.append(
-                f"{path}: {down:+.1f} px down, {right:+.1f} px right, rotation {one.rotation_deg:+.2f} deg, "
-                f"correlation {one.peak:.2f}, overlap {one.overlap:.0%}"
+                f"{path}: {down:+.1f} px down, {right:+.1f} px right, rotation {place.rotation_deg:+.2f} deg, "
+                f"correlation {place.peak:.2f}, overlap {place.overlap:.0%}"
             )
     return lines

@@ -72,9 +72,9 @@ class LeftOut:
 
 def left(pair: str, method: str | None, error: DiffuscopeError, progress: ProgressCallback) -> LeftOut:
     """Report a pair, or a method on it, that failed, and return it with the reason and its remedy."""
-    one = LeftOut(pair, method, f"{error.message}. {error.remedy}")
-    progress(f"  left out: {one}")
-    return one
+    left_out = LeftOut(pair, method, f"{error.message}. {error.remedy}")
+    progress(f"  left out: {left_out}")
+    return left_out
 
 
 class PairScorer:
@@ -99,9 +99,9 @@ class PairScorer:
             planes = [grey(picture)] * len(self._judges)
         scores = [judge(plane) for judge, plane in zip(self._judges, planes, strict=True)]
         return (
-            float(np.mean([one.psnr_db for one in scores])),
-            float(np.mean([one.ssim for one in scores])),
-            float(np.mean([one.pcc for one in scores])),
+            float(np.mean([score.psnr_db for score in scores])),
+            float(np.mean([score.ssim for score in scores])),
+            float(np.mean([score.pcc for score in scores])),
         )
 
 
@@ -123,10 +123,10 @@ def rows(scores: Sequence[PairScore]) -> tuple[Row, ...]:
         Row(
             *key,
             len(group),
-            float(np.median([one.seconds for one in group])),
-            Spread.of([one.psnr_db for one in group]),
-            Spread.of([one.ssim for one in group]),
-            Spread.of([one.pcc for one in group]),
+            float(np.median([score.seconds for score in group])),
+            Spread.of([score.psnr_db for score in group]),
+            Spread.of([score.ssim for score in group]),
+            Spread.of([score.pcc for score in group]),
         )
         for key, group in groups.items()
     )

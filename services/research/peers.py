@@ -72,12 +72,12 @@ class LenslessPeer:
         np.savez(self._folder / "in.npz", y=counts, psf=psf, rounds=np.array(self.rounds), memory=self.memory)
         return tuple(
             PeerPicture(
-                f"LenslessPiCam {one['version']} ADMM, {one['rounds']} rounds",
-                one["ms"] / 1e3,
-                one["mb"],
+                f"LenslessPiCam {run['version']} ADMM, {run['rounds']} rounds",
+                run["ms"] / 1e3,
+                run["mb"],
                 np.load(self._folder / f"{k}.npy"),
             )
-            for k, one in enumerate(json.loads(self._answer()))
+            for k, run in enumerate(json.loads(self._answer()))
         )
 
     def _answer(self) -> str:

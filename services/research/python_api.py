@@ -401,7 +401,7 @@ class SimulatedScene:
         StoreError
             A file cannot be written.
         """
-        scene_files.write(self.world, [np.asarray(one) for one in self.frames], Path(folder))
+        scene_files.write(self.world, [np.asarray(frame) for frame in self.frames], Path(folder))
 
 
 def simulate(
@@ -445,7 +445,7 @@ def simulate(
     world, taken = scene_files.expose(
         spec, lambda setting: decide(setting, everything=everything, only=tuple(only), without=tuple(without)), frames
     )
-    counts = tuple(one.view(SimulatedCounts) for one in taken)
+    counts = tuple(frame.view(SimulatedCounts) for frame in taken)
     colour = spec.light.colour
     mask = world.retina.vessels
     return SimulatedScene(
@@ -454,7 +454,7 @@ def simulate(
         truth=world.truth(colour),
         psf=crop_or_pad(world.psf(colour), world.shape),
         vessels=None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5,
-        plan={one.name: one for one in world.plan},
+        plan={decision.name: decision for decision in world.plan},
         frames=counts,
         world=world,
     )
@@ -551,7 +551,7 @@ def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOpti
     flat = given.get("flat")
     psfs = psf if isinstance(psf, list | tuple) else (psf,)
     return ReconstructOptions(
-        psfs=psf_stack([_source(one) for one in psfs]),
+        psfs=psf_stack([_source(source) for source in psfs]),
         method=given.get("method"),
         budget_s=given.get("budget_s"),
         dark=None if dark is None else _source(dark),

@@ -73,22 +73,22 @@ def reconstruct_colours(
     channels = _by_name(sources)
     darks = darks or {}
     _refuse_invalid_channels(channels, options, darks)
-    given = [source for one in channels.values() for source in one]
-    psfs = [one.psf for one in given if one.psf is not None]
-    refuse_outputs(output, (*(one.raw for one in given), *psfs, *darks.values()), options)
+    given = [source for channel in channels.values() for source in channel]
+    psfs = [source.psf for source in given if source.psf is not None]
+    refuse_outputs(output, (*(source.raw for source in given), *psfs, *darks.values()), options)
     reference: Colour = "green" if "green" in channels else next(iter(channels))
     of_colours = {
         name: replace(options, psfs=_psfs(given[0]), dark=darks.get(name, options.dark))
         for name, given in channels.items()
     }
-    raws = {name: [one.raw for one in given] for name, given in channels.items()}
+    raws = {name: [source.raw for source in given] for name, given in channels.items()}
     lit = raws.pop(reference)
     own = of_colours.pop(reference)
     capture = CaptureReconstructor(own, of_colours=of_colours if options.calibration is None else None)
     solved = _solved(capture, frames_of_capture(lit, raws, light=reference))
     made = solved.made
     if solved.colour is None:
-        reasons = "; ".join(f"{one.name}: {one.reason}" for one in made.report.channels if one.reason)
+        reasons = "; ".join(f"{channel.name}: {channel.reason}" for channel in made.report.channels if channel.reason)
         raise FrameError(f"no other colour can be joined to {reference}: {reasons}", "Look at these frames.")
     picture = np.zeros((*made.picture.shape, 3), np.float32)
     picture[solved.box] = solved.colour
@@ -123,13 +123,13 @@ def _refuse_invalid_channels(
     channels: Mapping[Colour, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
 ) -> None:
     """Raise SettingError for options that a colour picture does not have."""
-    given = [source for one in channels.values() for source in one]
-    if options.calibration is not None and (darks or any(one.psf is not None for one in given)):
+    given = [source for channel in channels.values() for source in channel]
+    if options.calibration is not None and (darks or any(source.psf is not None for source in given)):
         raise SettingError(
             "with a calibration a channel has no PSF and no dark frame of its own",
             "Give --channel NAME RAW, and --dark FILE.",
         )
-    if options.calibration is None and (options.psfs or options.bayer or any(one.psf is None for one in given)):
+    if options.calibration is None and (options.psfs or options.bayer or any(source.psf is None for source in given)):
         raise SettingError(
             "each channel has a PSF of its own", "Give --channel NAME RAW PSF, without --psf and --bayer."
         )
@@ -140,26 +140,26 @@ def _refuse_invalid_channels(
         raise SettingError(
             "a colour picture needs frames in two colours of light", "Give --channel again for another colour."
         )
-    for one in given:
-        if (light := stated_light(one.raw)) not in (None, one.name):
+    for source in given:
+        if (light := stated_light(source.raw)) not in (None, source.name):
             raise SettingError(
-                f"{name_of(one.raw, 'the raw')} was taken in {light} light, and is given as {one.name}",
+                f"{name_of(source.raw, 'the raw')} was taken in {light} light, and is given as {source.name}",
                 f"Give it as --channel {light}.",
             )
-    _refuse_other_pictures(options, [one.raw for one in given])
+    _refuse_other_pictures(options, [source.raw for source in given])
 
 
 def _by_name(sources: Sequence[ChannelSource]) -> dict[Colour, list[ChannelSource]]:
     """Return the sources of each channel, in the order in which they were given; SettingError for an unknown name."""
     channels: dict[Colour, list[ChannelSource]] = {}
-    for one in sources:
-        if one.name not in CHANNELS:
-            raise SettingError(f"'{one.name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
-        channels.setdefault(one.name, []).append(one)
+    for source in sources:
+        if source.name not in CHANNELS:
+            raise SettingError(f"'{source.name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
+        channels.setdefault(source.name, []).append(source)
     if not channels:
         raise SettingError("a colour picture needs a channel", "Give --channel NAME RAW PSF.")
     for name, given in channels.items():
-        if any(not _same(one.psf, given[0].psf) for one in given[1:]):
+        if any(not _same(other.psf, given[0].psf) for other in given[1:]):
             raise SettingError(f"{name} has several PSFs", "Give every raw of a colour with the PSF of that colour.")
     return channels
 
@@ -168,7 +168,9 @@ def _psfs(source: ChannelSource) -> tuple[Source, ...]:
     return () if source.psf is None else psf_stack([source.psf])
 
 
-def _same(one: Source | None, other: Source | None) -> bool:
-    if one is None or other is None or isinstance(one, Path) or isinstance(other, Path):
-        return one is other or (isinstance(one, Path) and isinstance(other, Path) and one.resolve() == other.resolve())
-    return np.array_equal(one, other)
+def _same(left: Source | None, right: Source | None) -> bool:
+    if left is None or right is None or isinstance(left, Path) or isinstance(right, Path):
+        return left is right or (
+            isinstance(left, Path) and isinstance(right, Path) and left.resolve() == right.resolve()
+        )
+    return np.array_equal(left, right)

@@ -79,11 +79,11 @@ def frames_of_capture(
     light: Colour | None = None,
 ) -> CaptureFrames:
     """Return the frames of a capture with the light (unless given) and the exposures that its raw files state."""
-    others = [one for frames in colours.values() for one in frames]
+    others = [source for frames in colours.values() for source in frames]
     full_drive_s = {
-        one.illumination.colour: one.exposure_s * one.illumination.level
-        for one in map(stated_by, (*reversed(others), lit[0]))
-        if one is not None and one.illumination is not None and one.exposure_s is not None
+        metadata.illumination.colour: metadata.exposure_s * metadata.illumination.level
+        for metadata in map(stated_by, (*reversed(others), lit[0]))
+        if metadata is not None and metadata.illumination is not None and metadata.exposure_s is not None
     }
     fits = _dark_fits(lit[0] if dark is None else dark, others)
     return CaptureFrames(tuple(lit), colours, dark, fits, light or stated_light(lit[0]), unusable or {}, full_drive_s)
@@ -91,8 +91,10 @@ def frames_of_capture(
 
 def _dark_fits(dark: Source, others: Iterable[Source]) -> bool:
     """Return True if the dark frame fits the frames in other colours of light, as far as they state an exposure."""
-    dark_s, *others_s = (None if one is None else one.exposure_s for one in map(stated_by, (dark, *others)))
-    return dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
+    dark_s, *others_s = (
+        None if metadata is None else metadata.exposure_s for metadata in map(stated_by, (dark, *others))
+    )
+    return dark_s is None or all(exposure_s is None or dark_fits(exposure_s, dark_s) for exposure_s in others_s)
 
 
 @dataclass(frozen=True)
@@ -125,12 +127,12 @@ class LoadedCapture:
     @property
     def usable(self) -> tuple[LoadedRaw, ...]:
         """Frames of the burst that may enter the picture."""
-        return tuple(one for k, one in enumerate(self.lit) if k not in self.unusable)
+        return tuple(frame for k, frame in enumerate(self.lit) if k not in self.unusable)
 
     @property
     def whole(self) -> tuple[LoadedRaw, ...]:
         """All frames: those of the burst, and those of the other colours."""
-        return (*self.lit, *(one for frames in self.others.values() for one in frames))
+        return (*self.lit, *(frame for frames in self.others.values() for frame in frames))
 
     @property
     def psfs(self) -> tuple[Psf, ...]:
@@ -170,8 +172,8 @@ class CaptureReconstructor:
         unusable = {**unusable_raws(lit), **frames.unusable}
         if len(unusable) == len(lit):
             raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take it again.")
-        common = common_raw([one for k, one in enumerate(lit) if k not in unusable])
-        others = {name: tuple(load_raw(one) for one in sources) for name, sources in frames.colours.items()}
+        common = common_raw([frame for k, frame in enumerate(lit) if k not in unusable])
+        others = {name: tuple(load_raw(source) for source in sources) for name, sources in frames.colours.items()}
         _refuse_different(common, others)
         plan, notes = self._plan(common, {name: common_raw(given) for name, given in others.items()}, frames)
         return LoadedCapture(frames, lit, others, unusable, common, plan, notes)
@@ -181,9 +183,9 @@ class CaptureReconstructor:
         frames = loaded.frames
         common = loaded.common
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
-        lit = [without_unknown(without_bad(one.raw), dark)[0] for one in loaded.lit]
+        lit = [without_unknown(without_bad(frame.raw), dark)[0] for frame in loaded.lit]
         others = {
-            name: [without_unknown(without_bad(one.raw), dark)[0] for one in given]
+            name: [without_unknown(without_bad(frame.raw), dark)[0] for frame in given]
             for name, given in loaded.others.items()
         }
         dark = None if dark is None else np.nan_to_num(dark)
@@ -206,7 +208,7 @@ class CaptureReconstructor:
         key = common.solved_shape, _levels(common), len(frames.lit) > 1, frames.light, index, counts
 
         def plan() -> _CaptureSolvers:
-            calibrations = {name: self._of_colour(name, one, whole, reference) for name, one in others.items()}
+            calibrations = {name: self._of_colour(name, raw, whole, reference) for name, raw in others.items()}
             return _CaptureSolvers(self._options, reference, calibrations, frames, self._planner, index)
 
         return self._plans.get_or_make(key, plan), notes
@@ -239,7 +241,7 @@ class CaptureReconstructor:
             raise FrameError(
                 f"{loaded.lit[0].name} holds no signal above the black level", "Give frames taken with light."
             )
-        of_raws = [note for one in loaded.whole for note in one.notes]
+        of_raws = [note for frame in loaded.whole for note in frame.notes]
         texts = [
             *doubts(made.report, plan.single, of_raws),
             *rejections(loaded.lit, frames),
@@ -250,7 +252,9 @@ class CaptureReconstructor:
         ]
         report = file_report(made.report, plan.single, self._options)
         report = replace(report, warnings=tuple(dict.fromkeys((*report.warnings, *texts))))
-        simulated = made.simulated or plan.single.calibration.simulated or any(one.simulated for one in loaded.whole)
+        simulated = (
+            made.simulated or plan.single.calibration.simulated or any(frame.simulated for frame in loaded.whole)
+        )
         colour = made.colour if isinstance(made, ColourReconstruction) else None
         box = field_box(plan.single.calibration, plan.single.shape)
         return CaptureReconstruction(FileReconstruction(made.picture, report, simulated), box, colour)
@@ -266,21 +270,24 @@ def _of_colours(made: ColourReconstruction, loaded: LoadedCapture) -> list[str]:
     notes = []
     for name, report in made.others.items():
         single = loaded.plan.singles[name]
-        words = *report.warnings, *doubts(report, single, [note for one in loaded.others[name] for note in one.notes])
-        notes += [f"{name}: {one}" for one in words]
+        words = (
+            *report.warnings,
+            *doubts(report, single, [note for frame in loaded.others[name] for note in frame.notes]),
+        )
+        notes += [f"{name}: {warning}" for warning in words]
         notes += rejections(loaded.others[name], report.frames)
-    predicted = [one.name for one in made.report.channels if one.predicted]
+    predicted = [channel.name for channel in made.report.channels if channel.predicted]
     return [*notes, *(f"{name} is predicted from the other colours, not measured." for name in predicted)]
 
 
 def _refuse_different(common: LoadedRaw, others: Mapping[Colour, Sequence[LoadedRaw]]) -> None:
     """Raise FrameError for a frame in another colour that has another size or kind of levels, or colours."""
     for name, frames in others.items():
-        for one in frames:
-            refuse_other_size(one, common)
-            if one.raw.shift != common.raw.shift:
+        for frame in frames:
+            refuse_other_size(frame, common)
+            if frame.raw.shift != common.raw.shift:
                 raise FrameError(
-                    f"{one.name}, in {name} light, has other levels than {common.name}",
+                    f"{frame.name}, in {name} light, has other levels than {common.name}",
                     "Give the frames of one capture, in one and the same camera mode.",
                 )
 
@@ -341,7 +348,9 @@ class _CaptureSolvers:
         deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
         order = sorted(range(len(lit)), key=lambda k: k in unusable)  # the first one must be usable
         reasons = {place: unusable[k] for place, k in enumerate(order) if k in unusable}
-        solved = {} if self._colours is None else {one: others[one] for one in others if one in self._colours.others}
+        solved = (
+            {} if self._colours is None else {name: others[name] for name in others if name in self._colours.others}
+        )
         of_green = deadline
         if self._colours is not None and deadline is not None:
             of_green = self._colours.deadline_of_green(deadline, solved)
@@ -383,4 +392,4 @@ class _CaptureSolvers:
 
 def _in_given_order(report: Report, order: Sequence[int]) -> tuple[FrameUse, ...]:
     """Return the use of the frames with the indices in which they were given."""
-    return tuple(sorted((replace(one, index=order[one.index]) for one in report.frames), key=lambda one: one.index))
+    return tuple(sorted((replace(use, index=order[use.index]) for use in report.frames), key=lambda use: use.index))

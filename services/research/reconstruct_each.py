@@ -35,8 +35,8 @@ def reconstruct_each(
         raise SettingError("a sweep is drawn for one raw", "Leave --sweep or --each out.")
     places = _places(raws, folder)
     reconstruct = FileReconstructor(options)
-    for one in (folder, *([] if reports is None else [reports])):
-        _make_folder(one)
+    for path in (folder, *([] if reports is None else [reports])):
+        _make_folder(path)
     clock = SystemClock()
     failed = 0
     noted = set[str]()

@@ -283,7 +283,7 @@ class _FrameSolvers:
             own = dark if dark is None or len(solvers) == 1 else plane(dark, c)
             made.append(solver(frame, own, simulated=solver.calibration.simulated, deadline=shared))
         main = made[0 if len(made) == 1 else _brightest(pixels)].report
-        picture = made[0].picture if len(made) == 1 else np.stack([one.picture for one in made], axis=2)
+        picture = made[0].picture if len(made) == 1 else np.stack([channel.picture for channel in made], axis=2)
         report = replace(
             file_report(main, solvers[0], options),
             seconds=summed_seconds(made),
@@ -298,9 +298,12 @@ class _FrameSolvers:
         options = self._options
         periodic = options.method is not None and find_method(options.method).periodic
         if len(self.calibrations) > 1 and options.bin is None and not periodic:
-            finest = min(default_schedule(one, self.shape, index)[1].bin for one in self.calibrations)
+            finest = min(default_schedule(calibration, self.shape, index)[1].bin for calibration in self.calibrations)
             options = replace(options, bin=finest)
-        return tuple(plan_reconstructor(options, one, self.shape, self._planner, index) for one in self.calibrations)
+        return tuple(
+            plan_reconstructor(options, calibration, self.shape, self._planner, index)
+            for calibration in self.calibrations
+        )
 
     def _most_likely_psf(self, loaded: LoadedRaw) -> int:
         """Return the index of the most likely PSF of a stack, by the brightest channel; draw the sweep plot."""
@@ -353,15 +356,15 @@ def _brightest(pixels: Pixels) -> int:
 def summed_seconds(made: Iterable[Reconstruction]) -> dict[str, float]:
     """Return the durations of each stage, in s, summed over several reconstructions."""
     seconds: dict[str, float] = {}
-    for one in made:
-        for stage, duration_s in one.report.seconds.items():
+    for reconstruction in made:
+        for stage, duration_s in reconstruction.report.seconds.items():
             seconds[stage] = seconds.get(stage, 0.0) + duration_s
     return seconds
 
 
 def _united(made: Iterable[Reconstruction]) -> tuple[str, ...]:
     """Return the warnings of all channels; NO_SIGNAL only if no channel has a signal."""
-    reports = [one.report for one in made]
+    reports = [reconstruction.report for reconstruction in made]
     some_lit = any(NO_SIGNAL not in report.warnings for report in reports)
     words = dict.fromkeys(warning for report in reports for warning in report.warnings)
     return tuple(word for word in words if not (some_lit and word == NO_SIGNAL))

@@ -261,8 +261,8 @@ def _psf_frames(source: Source, name: str) -> list[tuple[Raw, str]]:
         raise PsfError(error.message, error.remedy) from error
     count = len(file.frames)
     names = [label] if count == 1 else [f"{label}[{index}]" for index in range(count)]
-    counts = (psf_counts(frame, one) for frame, one in zip(file.frames, names, strict=True))
-    return [(with_levels(raw, file.levels)[0], one) for raw, one in zip(counts, names, strict=True)]
+    counts = (psf_counts(frame, psf_name) for frame, psf_name in zip(file.frames, names, strict=True))
+    return [(with_levels(raw, file.levels)[0], psf_name) for raw, psf_name in zip(counts, names, strict=True)]
 
 
 def _split_psf(psf: Raw, name: str, loaded: LoadedRaw, pattern: Bayer) -> Raw:

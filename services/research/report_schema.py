@@ -145,18 +145,18 @@ def _schema(kind: type) -> Any:
 
     def placed(value: Any) -> Any:
         if isinstance(value, list):
-            return [placed(one) for one in value]
+            return [placed(item) for item in value]
         if not isinstance(value, dict):
             return value
         part = placed(parts[value["$ref"].rpartition("/")[2]]) if "$ref" in value else {}
-        return part | {key: placed(one) for key, one in value.items() if key not in LEFT_OUT}
+        return part | {key: placed(item) for key, item in value.items() if key not in LEFT_OUT}
 
     return placed(schema)
 
 
 def _mapping(entry: Any) -> Any:
     """Return the part of the schema of an entry that is an object; the other part is null."""
-    return next(one for one in (entry, *entry.get("anyOf", ())) if one.get("type") == "object")
+    return next(part for part in (entry, *entry.get("anyOf", ())) if part.get("type") == "object")
 
 
 def _named(key: str, text: str) -> dict[str, JsonValue]:

@@ -101,7 +101,7 @@ def _sights_of_captures(
     psf_check = _psf_check(spec, kept.calibration)
     with CaptureStore(data) as store:
         found = [exposures(store, capture) for capture in taken[-CHECKED_CAPTURES:]]
-    return [assess_capture(kept.calibration, kept.provenance, psf_check, one) for one in found]
+    return [assess_capture(kept.calibration, kept.provenance, psf_check, exposure) for exposure in found]
 
 
 def _psf_check(spec: InstrumentSpec, calibration: Calibration) -> PsfMatchTest | None:

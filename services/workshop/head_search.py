@@ -78,8 +78,8 @@ def search(base: Design) -> list[Candidate]:
     for the sensor to be calibrated.
     """
     limits = light_limits()
-    found = [one for one in _candidates(base, limits) if one is not None]
-    return sorted(found, key=lambda one: (one.light_e < ENOUGH_E, one.lit_s, -one.light_e))
+    found = [candidate for candidate in _candidates(base, limits) if candidate is not None]
+    return sorted(found, key=lambda candidate: (candidate.light_e < ENOUGH_E, candidate.lit_s, -candidate.light_e))
 
 
 def _candidates(base: Design, limits: Limits) -> Iterator[Candidate | None]:
@@ -117,9 +117,9 @@ def _candidate(
     if inner_mm <= reflex_free_mm(design.optics.field_deg / 2) or design.relay.pupil_margin_mm(design.pupil_mm) < 0:
         return None
     whole = replace(design, led=replace(choice.led, power_mw=leds * choice.led.power_mw))
-    one = expected_beam(design)
+    led_beam = expected_beam(design)
     all_of_them = expected_beam(whole)
-    shares = limit_shares(design, replace(all_of_them, waist_w_per_cm2=one.waist_w_per_cm2), limits)
+    shares = limit_shares(design, replace(all_of_them, waist_w_per_cm2=led_beam.waist_w_per_cm2), limits)
     level = permitted_level(shares)
     factors = chain(whole, level, frames)
     if whole.share_in_pupil <= 0.5:
@@ -145,7 +145,7 @@ def _candidate(
 def table(base: Design, most: int = 25) -> str:
     """Return the best candidates as text, one line each, and the best of each kind of LED."""
     found = search(base)
-    enough = [one for one in found if one.light_e >= ENOUGH_E]
+    enough = [candidate for candidate in found if candidate.light_e >= ENOUGH_E]
     lines = [
         f"{len(found)} heads, {len(enough)} of them with at least {ENOUGH_E:g} electrons in a cell of 10 um; "
         "measured ring, guard factor 1.3",
@@ -153,13 +153,14 @@ def table(base: Design, most: int = 25) -> str:
         f"{'LED':<17}{'colour':<7}{'n':>3}{'ring':>7}{'iris':>6}{'ms':>5}{'x':>3}{'drive':>7}{'electrons':>10}"
         f"{'5 %':>8}{'um':>5}  most used limit",
     ]
-    best = {(one.choice.name, one.choice.colour): one for one in reversed(found)}
+    best = {(candidate.choice.name, candidate.choice.colour): candidate for candidate in reversed(found)}
     return "\n".join([*lines, *map(_line, found[:most]), "best of each LED:", *map(_line, best.values())])
 
 
-def _line(one: Candidate) -> str:
+def _line(candidate: Candidate) -> str:
     return (
-        f"{one.choice.name:<17}{one.choice.colour:<7}{one.leds:>3}{one.ring_mm:>7.2f}{one.iris_um / 1000:>6.1f}"
-        f"{1000 * one.exposure_s:>5.0f}{one.frames:>3}{one.level:>7.2f}{one.light_e:>10.0f}{one.low_e:>8.0f}"
-        f"{one.half_period_um:>5.0f}  {one.limit} {one.largest_share:.0%}"
+        f"{candidate.choice.name:<17}{candidate.choice.colour:<7}{candidate.leds:>3}{candidate.ring_mm:>7.2f}"
+        f"{candidate.iris_um / 1000:>6.1f}{1000 * candidate.exposure_s:>5.0f}{candidate.frames:>3}"
+        f"{candidate.level:>7.2f}{candidate.light_e:>10.0f}{candidate.low_e:>8.0f}"
+        f"{candidate.half_period_um:>5.0f}  {candidate.limit} {candidate.largest_share:.0%}"
     )

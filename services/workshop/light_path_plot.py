@@ -136,8 +136,10 @@ def _labels(named: list[tuple[Place, str]]) -> list[str]:
         x, y = _at(place)
         others = [lead for lead in leads if lead != x]
         tries = [(_box(x, row, anchor, words), anchor) for row in range(ROWS) for anchor in ("middle", "start", "end")]
-        free = (one for one in tries if not any(one[0][0] < lead < one[0][2] for lead in others))
-        box, anchor = next((one for one in free if not any(_overlap(one[0], other) for other in taken)), tries[-1])
+        free = (position for position in tries if not any(position[0][0] < lead < position[0][2] for lead in others))
+        box, anchor = next(
+            (position for position in free if not any(_overlap(position[0], other) for other in taken)), tries[-1]
+        )
         taken.append(box)
         out += [line(x, box[3] + 1, x, y - 3, "lead"), text(x, box[3] - 3, words, "small", anchor)]
     return out

@@ -109,7 +109,7 @@ def at_full_drive(design: Design, frames: int = 1) -> FullDrive:
     used = limit_shares(design, expected_beam(design), light_limits())[0].used
     share = used * np.exp(logs[:, bright].sum(axis=1) + bins)
     electrons = product(factors) * np.exp(logs.sum(axis=1)) * np.minimum(1, 1 / share)
-    (low, half, high), (low_e, half_e, high_e) = (np.quantile(one, (0.05, 0.5, 0.95)) for one in (share, electrons))
+    (low, half, high), (low_e, half_e, high_e) = (np.quantile(draws, (0.05, 0.5, 0.95)) for draws in (share, electrons))
     return FullDrive(
         Spread(float(half), float(low), float(high)),
         float((share > 1).mean()),
@@ -187,8 +187,9 @@ def table(design: Design, frames: int = 1) -> str:
 def _chain_lines(design: Design, factors: tuple[Factor, ...], frames: int) -> list[str]:
     lines = [f"{'factor':<26}{'value':>10} {'unit':<5}{'sd of ln':>8}  {'belongs to':<11}source"]
     lines += [
-        f"{one.name:<26}{one.value:>10.4g} {one.unit:<5}{one.spread:>8.2f}  {one.cause:<11}{one.source}"
-        for one in factors
+        f"{factor.name:<26}{factor.value:>10.4g} {factor.unit:<5}{factor.spread:>8.2f}  "
+        f"{factor.cause:<11}{factor.source}"
+        for factor in factors
     ]
     spread = simulated(factors)
     small = product(chain(replace(design, pupil_mm=SMALL_PUPIL_MM), frames=frames))
@@ -205,7 +206,7 @@ def _limit_lines(design: Design, limits: Limits, frames: int) -> list[str]:
     beams = (unmeasured_beam(design), expected_beam(design))
     both = [limit_shares(design, beam, limits) for beam in beams]
     for worst, expected in zip(*both, strict=True):
-        values = "".join(f" {f'{one.value:.3g} = {100 * one.used:.3g} %':>22}" for one in (worst, expected))
+        values = "".join(f" {f'{share.value:.3g} = {100 * share.used:.3g} %':>22}" for share in (worst, expected))
         lines.append(f"{worst.name:<26}{worst.limit:>5.4g} {worst.unit:>6}{values}")
     levels = [permitted_level(shares) for shares in both]
     doses = [
@@ -216,9 +217,9 @@ def _limit_lines(design: Design, limits: Limits, frames: int) -> list[str]:
     rows = {
         "permitted drive": [f"{level:.3g}" for level in levels],
         "dose of a picture, J/cm2": [f"{dose:.2g} = {100 * dose / stop:.2g} %" for dose in doses],
-        "electrons in a cell": [f"{one:.0f}" for one in electrons],
-        "half-period, um": [_half_period(design, one) for one in electrons],
-        f"enough ({ENOUGH_E:g} e-)": ["yes" if one >= ENOUGH_E else "no" for one in electrons],
+        "electrons in a cell": [f"{count:.0f}" for count in electrons],
+        "half-period, um": [_half_period(design, count) for count in electrons],
+        f"enough ({ENOUGH_E:g} e-)": ["yes" if count >= ENOUGH_E else "no" for count in electrons],
     }
     return [*lines, *(f"{name:<39} {first:>22} {second:>22}" for name, (first, second) in rows.items())]
 

@@ -61,7 +61,9 @@ def tolerances(design: Design, used: float, limits: Limits) -> tuple[Tolerance, 
         rows.append(("power of an LED", f"x {LED_POWER_UNCERTAINTY:g}", LED_POWER_UNCERTAINTY, [cap], [a], 1.0))
         rows.append(("wavelength in its bin", f"{1000 * BIN_UM:g} nm", bluer, [cap], [a], 1.0))
     worst = exp(hypot(*(log(row[2]) for row in rows)))
-    caps = [LedCap(one.hole_mm, two.height_mm, three.emitter_mm) for one, two, three in product(holes, heights, dies)]
+    caps = [
+        LedCap(hole.hole_mm, height.height_mm, die.emitter_mm) for hole, height, die in product(holes, heights, dies)
+    ]
     rows = [("as drawn", "", 1.0, [cap], [a], 1.0), *rows, ("together", "", worst, caps, relays, beside)]
     return tuple(
         Tolerance(name, size, used * times, *_ends(some, relay, seen, design.optics.field_deg))
@@ -80,11 +82,12 @@ def table(found: tuple[Tolerance, ...]) -> list[str]:
     """Return the tolerances as lines of text."""
     lines = [f"{'tolerance':<30}{'size':>8}{'of the limit':>14}{'half at, deg':>16}{'axis over mean':>16}"]
     return lines + [
-        f"{one.name:<30}{one.size:>8}{one.used:>13.0%} {_between(one.half_deg, 1):>16}{_between(one.centre, 2):>16}"
-        for one in found
+        f"{tolerance.name:<30}{tolerance.size:>8}{tolerance.used:>13.0%} {_between(tolerance.half_deg, 1):>16}"
+        f"{_between(tolerance.centre, 2):>16}"
+        for tolerance in found
     ]
 
 
 def _between(ends: Ends, digits: int) -> str:
-    low, high = (f"{one:.{digits}f}" for one in ends)
+    low, high = (f"{end:.{digits}f}" for end in ends)
     return low if low == high else f"{low} to {high}"

@@ -69,7 +69,7 @@ def in_colour(spec: InstrumentSpec, colour: str) -> InstrumentSpec:
     SpecError for a head without LEDs of that colour.
     """
     known: tuple[Colour, ...] = get_args(Colour)
-    found = next((one for one in known if one == colour), None)
+    found = next((name for name in known if name == colour), None)
     if found is None:
         raise SettingError(f"no colour is called {colour!r}", f"Choose one of {', '.join(known)}.")
     lamps = lamps_of(spec)
@@ -141,7 +141,10 @@ def words(reading: MeterReading, found: MeteredLight) -> str:
     )
     return "\n".join(
         [
-            *(f"{one.name:<14} {one.value:>9.3g} of {one.limit:g} {one.unit}: {one.used:.0%}" for one in found.shares),
+            *(
+                f"{share.name:<14} {share.value:>9.3g} of {share.limit:g} {share.unit}: {share.used:.0%}"
+                for share in found.shares
+            ),
             verdict,
             "",
             "[light.radiometry]",

@@ -58,9 +58,9 @@ def calibrate_with_lenses(
 def table(readings: Sequence[LensReading], fit: TrialLensFit) -> tuple[str, ...]:
     """Return one line per lens (nominal and measured correction, M beside the line), then one per finding."""
     lines = [f"{'lens':<22} {'nominal M  J0  J45':<22} {'measured M  J0  J45':<22} {'sd of M':>8} {'off line':>8}"]
-    for one, nominal, off_dpt in zip(readings, fit.nominals, fit.residuals_dpt, strict=True):
-        due, seen = (" ".join(f"{value:+6.2f}" for value in values) for values in (nominal, one.found))
-        lines.append(f"{one.lens.label:<22} {due:<22} {seen:<22} {one.sds.m_dpt:>8.2f} {off_dpt:>+8.2f}")
+    for reading, nominal, off_dpt in zip(readings, fit.nominals, fit.residuals_dpt, strict=True):
+        due, seen = (" ".join(f"{value:+6.2f}" for value in values) for values in (nominal, reading.found))
+        lines.append(f"{reading.lens.label:<22} {due:<22} {seen:<22} {reading.sds.m_dpt:>8.2f} {off_dpt:>+8.2f}")
     off = fit.offset
     lines.append(
         f"offset M {off.m_dpt:+.3f} (sd {off.m_sd_dpt:.3f}), J0 {off.j0_dpt:+.3f} (sd {off.j0_sd_dpt:.3f}), "
