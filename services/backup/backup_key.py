@@ -79,7 +79,7 @@ class BackupHeader(BaseModel):
 
     def encrypted(self, content: bytes) -> bytes:
         """Return content that only the holder of the secret key or of the passphrase can decrypt."""
-        recipients = [pyrage.x25519.Recipient.from_str(one) for one in self.recipients]
+        recipients = [pyrage.x25519.Recipient.from_str(recipient) for recipient in self.recipients]
         encrypted: bytes = pyrage.encrypt(content, recipients)
         return encrypted
 

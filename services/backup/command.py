@@ -74,15 +74,15 @@ def restore(
     secret = _secret_key(read_header(folder), identity, passphrase_file)
     with announcing("restoring"):
         found = restore_backup(folder, secret, data, _percent("restored"), number)
-        for one in found.damaged_backups:
-            say(f"Backup {one} is damaged; an older one is restored.")
+        for damaged in found.damaged_backups:
+            say(f"Backup {damaged} is damaged; an older one is restored.")
         for unit in found.damaged_units:
             say(f"Damaged in the backup, not restored: {unit}")
         CaptureStore(data).close()  # migrates the tables; where a record file is newer than its row, restores the row
         results = check_store(data, lambda line: say(f"{line} ..."))
     typer.echo(table(results))
     typer.echo(f"Backup {found.number} of {found.made_at:%Y-%m-%d %H:%M} UTC is restored in {data}.")
-    if found.damaged_units or found.damaged_backups or not all(one.is_whole for one in results):
+    if found.damaged_units or found.damaged_backups or not all(result.is_whole for result in results):
         sys.exit(1)
 
 

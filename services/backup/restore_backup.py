@@ -110,19 +110,19 @@ def _refuse_used(store: Path) -> None:
 def _newest_readable(folder: Path, key: SecretKey, number: int | None) -> tuple[Manifest, bytes, tuple[int, ...]]:
     """Return manifest and archive of a backup, and the numbers of newer ones that are damaged."""
     numbers = backup_numbers(folder)
-    wanted = [one for one in reversed(numbers) if number is None or one == number]
+    wanted = [known for known in reversed(numbers) if number is None or known == number]
     if not wanted:
         listed = ", ".join(map(str, numbers)) or "none"
         raise BackupDamaged(f"there is no backup {number or ''} in {folder}; present: {listed}")
     damaged: list[int] = []
-    for one in wanted:
+    for candidate in wanted:
         try:
-            path = backup_path(folder, one)
+            path = backup_path(folder, candidate)
             archive = _decrypted(path, read_backup_file(folder, path), key)
             return _manifest(archive), archive, tuple(damaged)
         except BackupDamaged as error:
-            log.error("backup %s cannot be used: %s", one, error.message)
-            damaged.append(one)
+            log.error("backup %s cannot be used: %s", candidate, error.message)
+            damaged.append(candidate)
     raise BackupDamaged(f"no backup in {folder} can be read with this key")
 
 

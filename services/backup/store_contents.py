@@ -30,7 +30,7 @@ NOT_BACKED_UP = frozenset(
 def units(store: Path) -> list[str]:
     """Return the paths of the second-level folders of a store, relative to it, sorted."""
     tops = (top for top in _kept_in(store) if top.is_dir())
-    return [str(one.relative_to(store)) for top in tops for one in _kept_in(top) if one.is_dir()]
+    return [str(folder.relative_to(store)) for top in tops for folder in _kept_in(top) if folder.is_dir()]
 
 
 def fingerprint(store: Path, unit: str) -> bytes:

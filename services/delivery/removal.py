@@ -56,7 +56,7 @@ class PictureRemoval:
         size_bytes = 0
         for visit in self._visits.visits(MAX_VISITS, open=False):
             reason = reason_to_remove(visit, sent, self._exports.exported_state(visit.id))
-            ids = [one.capture for slot in visit.slots.values() for one in slot.captures]
+            ids = [taken.capture for slot in visit.slots.values() for taken in slot.captures]
             sizes = {id: size for id in ids if (size := self._store.removed.removable_bytes(id))}
             if reason is not None and sizes:
                 found[reason] += sizes

@@ -136,8 +136,8 @@ class UploadWorker:
             log.info("visit uploaded, confirmed by %s", receipt.confirmed, extra={"about": due[0].visit})
         return True
 
-    def _record_failure(self, one: QueuedVisit, error: DiffuscopeError, which: list[QueuedVisit]) -> None:
-        log.warning("upload failed: %s", error, extra={"code": error.code, "about": one.visit})
+    def _record_failure(self, entry: QueuedVisit, error: DiffuscopeError, which: list[QueuedVisit]) -> None:
+        log.warning("upload failed: %s", error, extra={"code": error.code, "about": entry.visit})
         self.queue.record_failure(which, error)
 
     def _back_off(self) -> None:

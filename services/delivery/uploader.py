@@ -264,8 +264,8 @@ class _ReceiverConnection(HTTPConnection):
 
 def _digest(answer: HTTPResponse) -> str | None:
     """Return the SHA-256 (hexadecimal) in the Repr-Digest header of an answer; None without a valid one."""
-    for one in answer.headers.get("Repr-Digest", "").split(","):
-        name, _, value = one.strip().partition("=")
+    for entry in answer.headers.get("Repr-Digest", "").split(","):
+        name, _, value = entry.strip().partition("=")
         if name == "sha-256" and len(value) > 2 and value[0] == value[-1] == ":":
             with suppress(ValueError):
                 return base64.b64decode(value[1:-1], validate=True).hex()

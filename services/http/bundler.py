@@ -65,7 +65,7 @@ class _Module:
         if ending := _LIST.search(text):
             exports += "," + ending[1]
             text = text[: ending.start()] + "\n"
-        pairs = [one.split(" as ") for one in exports.split(",") if one.strip()]
+        pairs = [export.split(" as ") for export in exports.split(",") if export.strip()]
         self._exports = {pair[-1].strip(): pair[0].strip() for pair in pairs}  # exported name: local name
         self.text = _IMPORT.sub(self._import_statement, text)
         if left := _UNSUPPORTED.search(self.text):

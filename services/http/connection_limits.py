@@ -85,7 +85,7 @@ class ConnectionTable:
             return
         if self._counts.is_full(client):
             waiting = self._waiting[client.is_local]
-            rival = next((one for one in waiting if not one.is_sending()), connection)
+            rival = next((other for other in waiting if not other.is_sending()), connection)
             self.remove(rival)
             rival.drop()
             if rival is connection:
@@ -111,9 +111,9 @@ class ConnectionTable:
     def drop_overdue(self) -> None:
         """Drop every connection whose time-out is over; to be called several times per second."""
         now_s = self.clock.now_s()
-        for one in [one for one in self._open if one.is_overdue(now_s)]:
-            self.remove(one)
-            one.drop()
+        for overdue in [connection for connection in self._open if connection.is_overdue(now_s)]:
+            self.remove(overdue)
+            overdue.drop()
 
 
 class LimitedListener(socket.socket):

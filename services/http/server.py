@@ -264,7 +264,7 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to accept connections; asyncio sets the queue of the sockets to its number of accepts in a row."""
-        listeners = [LimitedListener(one, self._connections) for one in sockets or []]
+        listeners = [LimitedListener(server_socket, self._connections) for server_socket in sockets or []]
         await super().startup(list[socket.socket](listeners))
         for listener in listeners:
             listener.listen(LISTEN_QUEUE)

@@ -145,7 +145,7 @@ class CalibrationMonitor:
 
     def _publish_changes(self) -> None:
         """Publish the findings when the set of failed ones has changed."""
-        failed = tuple(one.name for one in self.findings if not one.ok)
+        failed = tuple(finding.name for finding in self.findings if not finding.ok)
         if failed != self._published:
             self._published = failed
             self._event_bus.publish("calibration", findings=self.findings)
@@ -161,21 +161,21 @@ def in_force_since(spec: InstrumentSpec) -> datetime:
 def captures_with_calibration(store: CaptureStore, calibration_id: str, since: datetime) -> Iterable[Capture]:
     """Return, oldest first, the captures with this calibration since `since`, of the latest REFRACTION_CAPTURES."""
     return (
-        one
-        for one in reversed(store.captures(REFRACTION_CAPTURES))
-        if one.calibration_id == calibration_id and one.taken_at >= since
+        capture
+        for capture in reversed(store.captures(REFRACTION_CAPTURES))
+        if capture.calibration_id == calibration_id and capture.taken_at >= since
     )
 
 
 def reported_refractions(captures: Iterable[Capture]) -> list[ReportedRefraction]:
     """Return the refraction of each capture that shows an eye, and whose report has one with numbers."""
     found = []
-    for one in filter(has_eye, captures):
-        report = one.report.refraction_dpt or {}
+    for capture in filter(has_eye, captures):
+        report = capture.report.refraction_dpt or {}
         sphere, *edge = (report.get(name) for name in ("sphere", "field_deg", "field_deg_sd"))
         if isinstance(sphere, int | float):
             diameter_deg, sd_deg = (float(value) if isinstance(value, int | float) else 0.0 for value in edge)
-            found.append(ReportedRefraction(one.taken_at, -float(sphere), diameter_deg, sd_deg))
+            found.append(ReportedRefraction(capture.taken_at, -float(sphere), diameter_deg, sd_deg))
     return found
 
 

@@ -152,7 +152,7 @@ def capture_files(
     green = picture_files.to_jpeg(shown, THUMBNAIL_PX, capture.simulated)
     thumbnail = green
     coloured = dict[str, FileContent]()
-    predicted = [one.name for one in capture.report.channels if one.predicted]
+    predicted = [channel.name for channel in capture.report.channels if channel.predicted]
     if colour is not None:
         colour = render_colour(colour)
         coloured[COLOUR] = picture_files.to_png(colour, capture.simulated, note, predicted, picture_files.DISPLAY)
@@ -170,8 +170,8 @@ def capture_files(
 def _frame_files(capture: Capture, head: str, shot: ExposedCapture) -> dict[str, FileContent]:
     """Return the raw frames of a capture by file name: the file that is on the disk already, or its content."""
     exposure = shot.exposure
-    frames = {lit_name(k): one for k, one in enumerate(exposure.lit)}
-    frames |= {colour_name(colour): one for colour, one in exposure.colours.items()}
+    frames = {lit_name(k): frame for k, frame in enumerate(exposure.lit)}
+    frames |= {colour_name(colour): frame for colour, frame in exposure.colours.items()}
     frames |= {} if exposure.dark is None else {DARK: exposure.dark}
     written = shot.written()
     shared = RawMetadata(capture.id, capture.eye, capture.taken_at, calibration_id=capture.calibration_id, head=head)

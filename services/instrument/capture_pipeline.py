@@ -100,7 +100,7 @@ class CapturePipeline:
         A pipeline of bursts prepares each lit frame while the next one is exposed, and splits the exposures as `split`
         says. `looked` is called in the thread of the preparation, with the quick look of the first useful frame.
         """
-        able = [] if self.colours is None else [one for one in colours if one in self.colours.others]
+        able = [] if self.colours is None else [other for other in colours if other in self.colours.others]
         run = partial(
             expose_press,
             self._head,
@@ -147,9 +147,9 @@ class CapturePipeline:
             return replace(taken, colours={})
         unable = self._unable(colours)
         lost = [
-            ChannelUse(one, None, reason=INTERRUPTED, code="colour.interrupted")
-            for one in colours
-            if one not in taken.colours and one in self.colours.others
+            ChannelUse(colour, None, reason=INTERRUPTED, code="colour.interrupted")
+            for colour in colours
+            if colour not in taken.colours and colour in self.colours.others
         ]
         able = {colour: frame for colour, frame in taken.colours.items() if colour in self.colours.others}
         return replace(taken, colours=able, missing=(*lost, *unable))
@@ -157,7 +157,7 @@ class CapturePipeline:
     def _unable(self, colours: Sequence[Colour]) -> tuple[ChannelUse, ...]:
         """Return each of `colours` that the pipeline cannot reconstruct; none without other colours."""
         able = colours if self.colours is None else self.colours.others
-        return tuple(without_psf(one) for one in colours if one not in able)
+        return tuple(without_psf(colour) for colour in colours if colour not in able)
 
     def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
         """Return the exposure with its first good frame at the front, and the verdict on that frame.
@@ -226,7 +226,7 @@ class CapturePipeline:
         colours = {colour: [frame.counts] for colour, frame in exposure.colours.items()}
         if exposure.dark is not None:
             dark_s = exposure.dark.exposure_s
-            dark = dark if all(dark_fits(one.exposure_s, dark_s) for one in exposure.colours.values()) else None
+            dark = dark if all(dark_fits(frame.exposure_s, dark_s) for frame in exposure.colours.values()) else None
         return self.colours.steps(
             green,
             colours,

@@ -65,8 +65,8 @@ class ExamService:
             head, store, event_bus, clock, lambda: requests.snapshot.is_interrupted, watchdog
         )
         resumed = resumed_presses(self.capture_journal, resumed_target)
-        for one in resumed:
-            requests.remember(one.press)
+        for resumption in resumed:
+            requests.remember(resumption.press)
         parts = ExamParts(
             head,
             store,

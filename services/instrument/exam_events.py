@@ -68,7 +68,7 @@ class ExamEvents:
 
     def forget_quick_look(self, id: str) -> None:
         """Remove the quick look of a capture that is no longer in progress."""
-        self._show_quick_looks({one: jpeg for one, jpeg in self.output.quick_looks.items() if one != id})
+        self._show_quick_looks({capture: jpeg for capture, jpeg in self.output.quick_looks.items() if capture != id})
 
     def verdict(self, id: str, verdict: Verdict) -> None:
         """Publish the verdict on a capture."""

@@ -392,7 +392,7 @@ def run_exam(
 def _fail_waiting(parts: ExamParts, loop: ExamLoop | None) -> None:
     """Fail the futures of all presses that were not completed, with Busy; the frames of exposed ones are kept."""
     pending = parts.requests.end()
-    exposed = {one.id: one.press for one in parts.resumed if not one.press.future.done()}
+    exposed = {resumed.id: resumed.press for resumed in parts.resumed if not resumed.press.future.done()}
     exposed |= loop.take_exposed() if loop is not None else {}
     for id, press in exposed.items():
         ended = Busy("the instrument was switched off before the picture was made", UNTIL_BACK)

@@ -56,7 +56,7 @@ class Exposure:
     def prepared(self) -> Mapping[int, PreparedFrame]:
         """What was prepared of the lit frames, by their index; without useless ones."""
         found = {k: self.ready.get(frame.number) for k, frame in enumerate(self.lit)}
-        return {k: one.prepared for k, one in found.items() if one is not None and one.prepared is not None}
+        return {k: frame.prepared for k, frame in found.items() if frame is not None and frame.prepared is not None}
 
 
 @dataclass(frozen=True)

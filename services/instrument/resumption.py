@@ -44,7 +44,7 @@ class ResumedPress:
     @property
     def files(self) -> Mapping[int, WrittenFile]:
         """The files on the disk by the number of their frame."""
-        return {one.number: one.file for one in self.stored.frames}
+        return {frame.number: frame.file for frame in self.stored.frames}
 
 
 @dataclass(frozen=True)
@@ -62,18 +62,18 @@ def resumed_presses(journal: CaptureJournal, target_of: ResumedTarget) -> tuple[
     `target_of` returns the target of a capture. One whose target is not known any more has failed.
     """
     found = []
-    for one in journal.resumable:
+    for capture in journal.resumable:
         try:
-            eye = one.press.eye
-            target = target_of(one)
+            eye = capture.press.eye
+            target = target_of(capture)
             if eye is None:
                 raise FrameError("the eye of the press is not known")
         except DiffuscopeError as error:
-            give_up(journal, one.press.id, error)
+            give_up(journal, capture.press.id, error)
             continue
         future: Future[Capture] = Future()
         future.set_running_or_notify_cancel()
-        found.append(ResumedPress(Press(future, eye, target, one.key), one))
+        found.append(ResumedPress(Press(future, eye, target, capture.key), capture))
     return tuple(found)
 
 
@@ -96,16 +96,16 @@ def resumed_frames(stored: ResumableCapture, calibration: Calibration, now_s: fl
 
     FrameError if a file cannot be read, has no time, or there is no lit frame.
     """
-    loaded = [(one, *_loaded(one.load)) for one in stored.frames]
-    lit = tuple(frame for one, frame, _ in loaded if one.is_lit)
-    dark = next((frame for one, frame, _ in loaded if one.file.path.name == DARK), None)
+    loaded = [(stored_frame, *_loaded(stored_frame.load)) for stored_frame in stored.frames]
+    lit = tuple(frame for stored_frame, frame, _ in loaded if stored_frame.is_lit)
+    dark = next((frame for stored_frame, frame, _ in loaded if stored_frame.file.path.name == DARK), None)
     taken_at = loaded[0][2].taken_at if loaded else None
     if not lit or taken_at is None:
         raise FrameError("the frames on the disk are not those of a press")
     colours: dict[Colour, Frame] = {
         frame.illumination.colour: frame
-        for one, frame, _ in loaded
-        if not one.is_lit and frame.illumination is not None
+        for stored_frame, frame, _ in loaded
+        if not stored_frame.is_lit and frame.illumination is not None
     }
     last = stored.frames[-1]
     exposure = Exposure(lit, colours, dark, now_s, last.exposed_s, last.dose_j_per_cm2)

@@ -65,25 +65,25 @@ def interrupted_captures(arbiter: HeadArbiter, visits: VisitRepository) -> list[
     exam = arbiter.current_exam
     if exam is None:
         return []
-    exam.capture_journal.discard(lambda one: _is_over(one, visits))
+    exam.capture_journal.discard(lambda capture: _is_over(capture, visits))
     with suppress(StoreError):  # then the next start reports the test pictures again
         exam.capture_journal.mark_reported()
     return list(exam.capture_journal.interrupted)
 
 
-def _is_over(one: InterruptedCapture, visits: VisitRepository) -> bool:
+def _is_over(capture: InterruptedCapture, visits: VisitRepository) -> bool:
     """Return whether an interrupted capture needs no repetition.
 
     True if its slot has a newer capture or is unknown, or its visit is finished or unreadable; False without visit.
     """
-    if one.visit is None or one.slot is None:
+    if capture.visit is None or capture.slot is None:
         return False
     try:
-        visit = visits.get(one.visit)
+        visit = visits.get(capture.visit)
     except DiffuscopeError:
         return True
-    slot = visit.slots.get(one.slot)
-    return visit.finished_at is not None or slot is None or len(slot.captures) > one.tries
+    slot = visit.slots.get(capture.slot)
+    return visit.finished_at is not None or slot is None or len(slot.captures) > capture.tries
 
 
 def _reading(read: Callable[[], float]) -> DiffuscopeError | float:

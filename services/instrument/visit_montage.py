@@ -90,7 +90,7 @@ class MontageMaker:
         Errors: StoreDamaged, RecordNotFound for a chosen picture whose record cannot be read.
         """
         pictures = self._pictures(visit, protocol, eye)
-        digest = hashlib.sha256(" ".join(one.digest for one in pictures).encode()).hexdigest()
+        digest = hashlib.sha256(" ".join(picture.digest for picture in pictures).encode()).hexdigest()
         if len(pictures) < 2:
             return VisitMontage(pictures, digest, "none")
         with self._lock:
@@ -155,8 +155,8 @@ class MontageMaker:
                     self._kept.put(digest, made)
 
     def _computed(self, pictures: Sequence[VisitPicture]) -> JoinedPictures:
-        content = [self._store.read(one.capture, PICTURE) for one in pictures]
-        simulated = any(one.simulated for one in pictures)
+        content = [self._store.read(picture.capture, PICTURE) for picture in pictures]
+        simulated = any(picture.simulated for picture in pictures)
         joined: JoinedPictures = run_in_subprocess(
             join_pictures, content, simulated, self._px_per_deg, report=lambda _: None, may_run=self._may_run
         )
@@ -178,22 +178,24 @@ def join_pictures(
     Pictures of another size than the first one come from another calibration and stay apart. FrameError for a file that
     is no picture, or black. Numbers are rounded to what they mean: 0.1 pixels and degrees, 0.01 of peak and overlap.
     """
-    pictures = [read_png(one) for one in content]
-    fitting = [k for k, one in enumerate(pictures) if one.shape == pictures[0].shape]
+    pictures = [read_png(file) for file in content]
+    fitting = [k for k, picture in enumerate(pictures) if picture.shape == pictures[0].shape]
     joined = make_montage([pictures[k] for k in fitting], progress, px_per_deg)
-    placed = {k: replace(_rounded(one), index=k) for k, one in zip(fitting, joined.placed, strict=True)}
+    placed = {k: replace(_rounded(placement), index=k) for k, placement in zip(fitting, joined.placed, strict=True)}
     for k in range(len(pictures)):
         if k not in placed:
             placed[k] = Placement(k, False, None, None, None, None, "it was taken with another calibration")
-    is_joined = sum(one.used for one in placed.values()) > 1
+    is_joined = sum(placement.used for placement in placed.values()) > 1
     png = to_png(joined.picture, simulated, "montage") if is_joined else None
     return JoinedPictures(tuple(placed[k] for k in range(len(pictures))), png, joined.projection)
 
 
-def _rounded(one: Placement) -> Placement:
-    shift_px = None if one.shift_px is None else (round(one.shift_px[0], 1), round(one.shift_px[1], 1))
+def _rounded(placement: Placement) -> Placement:
+    shift_px = (
+        None if placement.shift_px is None else (round(placement.shift_px[0], 1), round(placement.shift_px[1], 1))
+    )
     turn_deg, peak, overlap = (
         None if value is None else round(value, digits)
-        for value, digits in ((one.rotation_deg, 1), (one.peak, 2), (one.overlap, 2))
+        for value, digits in ((placement.rotation_deg, 1), (placement.peak, 2), (placement.overlap, 2))
     )
-    return replace(one, shift_px=shift_px, rotation_deg=turn_deg, peak=peak, overlap=overlap)
+    return replace(placement, shift_px=shift_px, rotation_deg=turn_deg, peak=peak, overlap=overlap)

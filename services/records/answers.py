@@ -87,7 +87,7 @@ def _complaints(value: object) -> FormValue:
     """Return a list of different known complaints, with "none" only alone; None (no answer) for an empty list."""
     if not isinstance(value, list) or len(value) > len(COMPLAINTS):
         raise _wrong(value, f"Choose from: {', '.join(COMPLAINTS)}.")
-    chosen = [_choice(one, COMPLAINTS) for one in value]
+    chosen = [_choice(complaint, COMPLAINTS) for complaint in value]
     if len(set(chosen)) < len(chosen) or ("none" in chosen and len(chosen) > 1):
         raise _wrong(value, "Choose each complaint once, and 'none' alone.")
     return chosen or None

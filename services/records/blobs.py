@@ -48,10 +48,10 @@ def write_folder(folder: Path, contents: Mapping[str, FileContent]) -> None:
     A file that is on the disk already gets a second name (hard link), or is copied on a file system without hard links.
     OSError if the folder exists or the disk refuses.
     """
-    atomic_io.write_folder(folder, {name: one for name, one in contents.items() if isinstance(one, bytes)})
-    linked = {name: one for name, one in contents.items() if not isinstance(one, bytes)}
-    for name, one in linked.items():
-        _link_or_copy(one.path, folder / name)
+    atomic_io.write_folder(folder, {name: content for name, content in contents.items() if isinstance(content, bytes)})
+    linked = {name: content for name, content in contents.items() if not isinstance(content, bytes)}
+    for name, file in linked.items():
+        _link_or_copy(file.path, folder / name)
     if linked:
         atomic_io.fsync_folder(folder)
 

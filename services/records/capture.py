@@ -195,7 +195,7 @@ class ShownReport(StoredRecord, DoseReport, Report):
         """Return the numbers of an object: null is none."""
         if not isinstance(value, Mapping):
             return value
-        return {name: one for name, one in value.items() if one is not None}
+        return {name: number for name, number in value.items() if number is not None}
 
     @field_validator("refraction_dpt", mode="before")
     @classmethod
@@ -205,7 +205,7 @@ class ShownReport(StoredRecord, DoseReport, Report):
             return value
         if not _is_figure("sphere", value.get("sphere")):
             raise ValueError("sphere: neither a number nor null")
-        return {name: one for name, one in value.items() if _is_figure(name, one)}
+        return {name: figure for name, figure in value.items() if _is_figure(name, figure)}
 
 
 @dataclass(frozen=True, config=CONFIG)

@@ -89,9 +89,9 @@ class CaptureJournal:
         if store.refusal is None:
             self._remove_strays()
             kept = ((found[id], _plan(entry)) for id, entry in entries.items() if id in found)
-            self.resumable = tuple(one for press, plan in kept if (one := self._resumable(press, plan)))
-        resumable = {one.press.id for one in self.resumable}
-        self.interrupted = tuple(one for id, one in found.items() if id not in resumable)
+            self.resumable = tuple(resumed for press, plan in kept if (resumed := self._resumable(press, plan)))
+        resumable = {capture.press.id for capture in self.resumable}
+        self.interrupted = tuple(press for id, press in found.items() if id not in resumable)
 
     def begin(
         self,
@@ -130,21 +130,21 @@ class CaptureJournal:
         """
         with storage_errors():
             (self._folder / f"{id}.json").unlink(missing_ok=True)
-        self.resumable = tuple(one for one in self.resumable if one.press.id != id)
+        self.resumable = tuple(capture for capture in self.resumable if capture.press.id != id)
         self._remove_frames(id)
         if key is not None:
-            self.discard(lambda one: self._keys.get(one.id) == key)
+            self.discard(lambda press: self._keys.get(press.id) == key)
 
     def fail(self, id: str) -> None:
         """Delete the frames of a capture that has failed, and its entry; one that was resumed is interrupted then.
 
         StoreError if the disk refuses.
         """
-        resumed = next((one.press for one in self.resumable if one.press.id == id), None)
+        resumed = next((capture.press for capture in self.resumable if capture.press.id == id), None)
         if resumed is None:
             self.end(id)
             return
-        self.resumable = tuple(one for one in self.resumable if one.press.id != id)
+        self.resumable = tuple(capture for capture in self.resumable if capture.press.id != id)
         self.interrupted = (*self.interrupted, resumed)
         self._remove_frames(id)
 
@@ -156,7 +156,7 @@ class CaptureJournal:
         folder = self._folder / id
         if (writer := self._writers.pop(id, None)) is not None:
             writer.close(complete=True)
-        if not any(one.is_lit for one in stored_frames(folder)):
+        if not any(frame.is_lit for frame in stored_frames(folder)):
             self.fail(id)
             return False
         with storage_errors():
@@ -166,10 +166,10 @@ class CaptureJournal:
 
     def discard(self, is_handled: Callable[[InterruptedCapture], bool]) -> None:
         """Remove the captures for which `is_handled` is true from `interrupted`, and delete their entries."""
-        discarded = [one for one in self.interrupted if is_handled(one)]
-        for one in discarded:
-            self.end(one.id)
-        self.interrupted = tuple(one for one in self.interrupted if one not in discarded)
+        discarded = [press for press in self.interrupted if is_handled(press)]
+        for handled in discarded:
+            self.end(handled.id)
+        self.interrupted = tuple(press for press in self.interrupted if press not in discarded)
 
     def mark_reported(self) -> None:
         """Delete the entries of interrupted test pictures, which were reported; they stay in `interrupted` in this run.
@@ -177,9 +177,9 @@ class CaptureJournal:
         A picture of a visit keeps its entry until it is repeated or the visit is finished. StoreError if the disk
         refuses.
         """
-        for one in self.interrupted:
-            if one.visit is None:
-                self.end(one.id)
+        for press in self.interrupted:
+            if press.visit is None:
+                self.end(press.id)
 
     def close(self) -> None:
         """Wait until the frames of captures that are still in progress are on the disk, for the next opening."""
@@ -193,7 +193,7 @@ class CaptureJournal:
         """
         folder = self._folder / press.id
         frames = stored_frames(folder)
-        if plan is None or not any(one.is_lit for one in frames) or _attempts(folder) >= MAX_ATTEMPTS:
+        if plan is None or not any(frame.is_lit for frame in frames) or _attempts(folder) >= MAX_ATTEMPTS:
             with suppress(StoreError):  # then the next opening deletes them
                 self._remove_frames(press.id)
             return None
@@ -244,7 +244,7 @@ def _plan(entry: JsonObject) -> _Plan | None:
     try:
         colours = entry["colours"]
         named = colours if isinstance(colours, list) else []
-        return whole_number(entry["planned"]), tuple(one for one in OTHER_COLOURS if one in named)
+        return whole_number(entry["planned"]), tuple(colour for colour in OTHER_COLOURS if colour in named)
     except (ValueError, KeyError):
         return None
 

@@ -68,10 +68,10 @@ class CaptureVersions:
             with row_validation.reading_record(row.id):
                 report = CaptureReport.parse(row.report)
             _refuse_foreign(new, row, None if report.device is None else report.device.uuid)
-            known = next((one for one in report.versions if one.result == new.result), None)
+            known = next((earlier for earlier in report.versions if earlier.result == new.result), None)
             if known is not None:
                 return known
-            number = max((one.number for one in report.versions), default=0) + 1
+            number = max((earlier.number for earlier in report.versions), default=0) + 1
             version = CaptureVersion(number, new.result, at.isoformat(), new.method, new.software)
             self._write(row, version, new)
             row.report = schema.report_text(report.with_version(version))
@@ -118,6 +118,6 @@ def _refuse_foreign(new: NewVersion, row: CaptureRow, device: str | None) -> Non
             f"{row.id} was taken by the device {device}, and the new picture by {new.device}",
             "Adopt it in the store of that device.",
         )
-    kept = {one.name: one.sha256 for one in row.files if RAW_FRAME.fullmatch(one.name) or one.name == DARK_FRAME}
+    kept = {file.name: file.sha256 for file in row.files if RAW_FRAME.fullmatch(file.name) or file.name == DARK_FRAME}
     if differing := sorted(name for name in {*kept, *new.frames} if kept.get(name) != new.frames.get(name)):
         raise VersionRefused(f"{row.id} holds other frames than the new picture was made from: {', '.join(differing)}")

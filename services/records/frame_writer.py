@@ -132,7 +132,7 @@ def stored_frames(folder: Path) -> tuple[StoredFrame, ...]:
             found.append(_checked(folder / note.stem, digested_json.decoded(read_blob(note))))
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning("%s of the interrupted capture %s is left out: %s", note.stem, folder.name, error)
-    return tuple(sorted(found, key=lambda one: one.number))
+    return tuple(sorted(found, key=lambda frame: frame.number))
 
 
 def _note_of(file: WrittenFile, taken: TakenFrame) -> JsonObject:

@@ -84,9 +84,9 @@ def slot_of_same_field(protocol: Protocol, slot: str, eye: Eye) -> Slot:
     InputError if the protocol has none, RecordNotFound if `slot` is unknown.
     """
     field = protocol.slot(slot).field
-    for one in protocol.slots:
-        if (one.eye, one.field) == (eye, field):
-            return one
+    for candidate in protocol.slots:
+        if (candidate.eye, candidate.field) == (eye, field):
+            return candidate
     raise InputError(f"eye: the programme has no picture of the {field} of {eye}", CHOOSE_REMEDY)
 
 
@@ -101,7 +101,7 @@ def relabel(session: Session, shot: CaptureSlotRow, to: Slot, at: datetime, by: 
     from_eye = _eye(row)
     correction = EyeCorrection(from_eye, shot.slot, to.eye, at.isoformat(), by)
     report = _report(row).with_correction(to.id, correction)
-    counted = {from_eye, *(one.from_eye for one in report.moved)}
+    counted = {from_eye, *(move.from_eye for move in report.moved)}
     if to.eye not in counted:
         add_given_dose(session, to.eye, report.dose_j_per_cm2 or 0.0)
     row.eye = to.eye

@@ -20,9 +20,11 @@ def patient_number(session: Session, prefix: str, number: str | None, made_at: s
     if number is None:
         number = _next_number(session, prefix)
     elif session.get(PatientRow, number) is None:
-        prefixes = [prefix, *(one for one in session.scalars(select(CounterRow.prefix)) if one != prefix)]
-        known = next((one + number for one in prefixes if session.get(PatientRow, one + number) is not None), None)
-        if known is None and any(_is_mistyped(one, number) for one in prefixes):
+        prefixes = [prefix, *(earlier for earlier in session.scalars(select(CounterRow.prefix)) if earlier != prefix)]
+        known = next(
+            (start + number for start in prefixes if session.get(PatientRow, start + number) is not None), None
+        )
+        if known is None and any(_is_mistyped(start, number) for start in prefixes):
             raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
         number = known or number
     if session.get(PatientRow, number) is None:

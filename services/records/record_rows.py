@@ -92,7 +92,7 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
     uploads = _grouped((row.visit, row.finished_at, row) for row in sent if row is not None)
     numbers = row_validation.readable_keys(row.patient for row in rows)
     query = select(PatientRow.number, PatientRow.patient_id).where(PatientRow.number.in_(numbers))
-    patients: dict[str, str] = {one.number: one.patient_id for one in session.execute(query)}
+    patients: dict[str, str] = {row.number: row.patient_id for row in session.execute(query)}
 
     def content(row: VisitRow) -> Content:
         return {
@@ -123,8 +123,8 @@ def restore_patient(session: Session, content: JsonObject) -> bool:
     row, identifiers = _patient_rows(content)
     described = row.number
     row.number = _free_number(session, described, row.patient_id)
-    for one in identifiers:
-        one.patient = row.number
+    for identifier in identifiers:
+        identifier.patient = row.number
     session.execute(delete(IdentifierRow).where(IdentifierRow.patient == row.number))
     session.merge(row)
     session.flush()
@@ -176,9 +176,9 @@ def restore_decisions(session: Session, content: JsonObject) -> list[str]:
     """
     row, _, _, decisions = _visit_rows(content)
     session.execute(delete(SlotDecisionRow).where(SlotDecisionRow.visit == row.id))
-    chosen = {one.capture for one in decisions if one.capture is not None}
+    chosen = {decision.capture for decision in decisions if decision.capture is not None}
     present = set(session.scalars(select(CaptureRow.id).where(CaptureRow.id.in_(chosen))))
-    session.add_all(one for one in decisions if one.capture is None or one.capture in present)
+    session.add_all(decision for decision in decisions if decision.capture is None or decision.capture in present)
     session.flush()
     return sorted(chosen - present)
 
@@ -270,16 +270,18 @@ def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[Up
         sent=sent,
         request=request,
     )
-    answers = [(row_validation.text(name), as_object(one)) for name, one in as_object(content["answers"]).items()]
-    uploads = [_upload_row(id, at, as_object(one)) for at, one in as_object(content["uploads"]).items()]
+    answers = [(row_validation.text(name), as_object(answer)) for name, answer in as_object(content["answers"]).items()]
+    uploads = [_upload_row(id, at, as_object(upload)) for at, upload in as_object(content["uploads"]).items()]
     return (
         row,
         [
-            AnswerRow(visit=id, name=name, value=json.dumps(one["value"]), set_at=row_validation.text(one["set_at"]))
-            for name, one in answers
+            AnswerRow(
+                visit=id, name=name, value=json.dumps(answer["value"]), set_at=row_validation.text(answer["set_at"])
+            )
+            for name, answer in answers
         ],
         uploads,
-        [_decision_row(id, slot, as_object(one)) for slot, one in as_object(content["decisions"]).items()],
+        [_decision_row(id, slot, as_object(decision)) for slot, decision in as_object(content["decisions"]).items()],
     )
 
 

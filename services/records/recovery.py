@@ -106,7 +106,7 @@ class Recovery:
 
     def _run(self, session: Session) -> None:
         to_write = [*self._reconcile(session, "patient"), *self._reconcile(session, "visit")]
-        suspicious = {*self.report.visits, *(one.id for one in to_write if one.kind == "visit")}
+        suspicious = {*self.report.visits, *(record.id for record in to_write if record.kind == "visit")}
         to_write += self._reconcile(session, "capture", suspicious)
         record_rows.restore_slots(session)
         for document, as_described in self._restored_visits:
@@ -119,7 +119,9 @@ class Recovery:
     def _id_in_file(self, damaged: PatientRow) -> str:
         """Return the id of the patient whose file has the number of a damaged row, which may have another id."""
         documents = (self._file("patient", id) for id in self._files.ids("patient"))
-        numbered = [one for one in documents if one is not None and one.content["number"] == damaged.number]
+        numbered = [
+            document for document in documents if document is not None and document.content["number"] == damaged.number
+        ]
         return numbered[0].id if numbered else damaged.patient_id
 
     def _reconcile(self, session: Session, kind: Kind, of_visits: set[str] | None = None) -> list[RecordDocument]:
@@ -236,7 +238,7 @@ class Recovery:
         if kind != "capture":
             return list(self._files.ids(kind))
         folder = self._folder / "captures"
-        return [one.name for one in files_in(folder) if one.is_dir()]
+        return [path.name for path in files_in(folder) if path.is_dir()]
 
     def _log(self) -> None:
         report = self.report
@@ -286,9 +288,9 @@ def _last_change(content: JsonObject) -> datetime:
 
 def _timestamps(value: object) -> list[datetime]:
     if isinstance(value, dict):
-        return [one for entry in value.values() for one in _timestamps(entry)]
+        return [timestamp for entry in value.values() for timestamp in _timestamps(entry)]
     if isinstance(value, list):
-        return [one for entry in value for one in _timestamps(entry)]
+        return [timestamp for entry in value for timestamp in _timestamps(entry)]
     try:
         return [row_validation.timestamp(value)]
     except ValueError:

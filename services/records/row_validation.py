@@ -63,7 +63,7 @@ def _is_utf8(value: str) -> bool:
 
 def form_value(value: object) -> FormValue:
     """Return the value unchanged if it can be the answer to a form field; ValueError for another type."""
-    texts = isinstance(value, list) and all(isinstance(one, str) for one in value)
+    texts = isinstance(value, list) and all(isinstance(item, str) for item in value)
     if value is None or texts or isinstance(value, str | int):
         return cast(FormValue, value)
     raise ValueError(f"{type(value).__name__} where an answer was kept")

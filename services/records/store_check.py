@@ -94,11 +94,11 @@ def _checked_records(
     for id, in_rows in _records_in_rows(folder, kind) if with_rows else ():
         known.add(id)
         in_file = _in_file(files, kind, id)
-        whole = [one for one in (in_rows, in_file) if one is not None]
+        whole = [document for document in (in_rows, in_file) if document is not None]
         if not whole:
             result.damaged.append(id)
             continue
-        documents[kind, id] = max(whole, key=lambda one: one.revision)
+        documents[kind, id] = max(whole, key=lambda document: document.revision)
         if len(whole) == 2 and whole[0].sha256() == whole[1].sha256():
             result.whole += 1
         else:
@@ -120,7 +120,7 @@ def _records_in_rows(folder: Path, kind: Kind) -> Iterator[tuple[str, RecordDocu
             keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
             for start in range(0, len(keys), record_signing.PAGE_ROWS):
                 page = keys[start : start + record_signing.PAGE_ROWS]
-                whole = {one.key: one for one in record_signing.documents_of(session, kind, page)}
+                whole = {record.key: record for record in record_signing.documents_of(session, kind, page)}
                 for row in record_signing.rows_of(session, kind, page):
                     document = whole.get(schema.record_key(row))
                     yield row.patient_id if isinstance(row, schema.PatientRow) else row.id, document
@@ -139,7 +139,7 @@ def _in_file(files: RecordFiles, kind: Kind, id: str) -> RecordDocument | None:
 def _ids_of_files(folder: Path, kind: Kind) -> list[str]:
     if kind != "capture":
         return list(RecordFiles(folder).ids(kind))
-    return [one.name for one in files_in(folder / "captures") if one.is_dir()]
+    return [path.name for path in files_in(folder / "captures") if path.is_dir()]
 
 
 def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocument]) -> Checked:

@@ -27,8 +27,8 @@ def check(
     from services.records.store_check import check_store  # deferred: imports SQLAlchemy
 
     results = check_store(data, lambda line: say(f"{line} ..."))
-    typer.echo(json.dumps([asdict(one) for one in results], indent=1) if as_json else table(results))
-    if not all(one.is_whole for one in results):
+    typer.echo(json.dumps([asdict(result) for result in results], indent=1) if as_json else table(results))
+    if not all(result.is_whole for result in results):
         sys.exit(1)
 
 
@@ -56,7 +56,9 @@ def rebuild(
 def table(results: list["Checked"]) -> str:
     """Return the results as a table of text, followed by the names of what is not whole."""
     lines = [f"{'':<26}{'whole':>8}{'healable':>10}{'damaged':>9}"]
-    lines += [f"{one.name:<26}{one.whole:>8}{len(one.healable):>10}{len(one.damaged):>9}" for one in results]
-    lines += [f"healable by the next start: {one.name}: {name}" for one in results for name in one.healable]
-    lines += [f"damaged: {one.name}: {name}" for one in results for name in one.damaged]
+    lines += [
+        f"{result.name:<26}{result.whole:>8}{len(result.healable):>10}{len(result.damaged):>9}" for result in results
+    ]
+    lines += [f"healable by the next start: {result.name}: {name}" for result in results for name in result.healable]
+    lines += [f"damaged: {result.name}: {name}" for result in results for name in result.damaged]
     return "\n".join(lines)

@@ -88,12 +88,12 @@ class StoredRecord:
         """Return the record of a JSON object; a value of the program is validated as it is."""
         if not isinstance(value, Mapping):
             return handler(value)
-        names = {one.name for one in dataclasses.fields(cls)} - {"others"}
+        names = {field.name for field in dataclasses.fields(cls)} - {"others"}
         entries = {name: entry for name, entry in value.items() if name in names and entry is not None}
         try:
             record = handler(entries)
         except ValidationError as error:
-            wrong = {str(one["loc"][0]) for one in error.errors()}
+            wrong = {str(detail["loc"][0]) for detail in error.errors()}
             if wrong & cls.CHECKED:
                 raise
             record = handler({name: entry for name, entry in entries.items() if name not in wrong})
@@ -108,7 +108,7 @@ class StoredRecord:
             return written
         if info.context is _STORING:
             return written | self.others
-        known = {one.name for one in dataclasses.fields(self)} | self.COMPUTED
+        known = {field.name for field in dataclasses.fields(self)} | self.COMPUTED
         return written | {name: entry for name, entry in self.others.items() if name not in known}
 
 

@@ -108,7 +108,7 @@ class UploadQueue:
         with storage_errors(), Session(self.engine) as session:
             waiting, many, tried = session.execute(query).one()
             since = without_damaged(session.scalars(dates).all(), _failing_since) if many else []
-        return QueueStatus(waiting, many, min((one for one in since if one is not None), default=None), tried)
+        return QueueStatus(waiting, many, min((moment for moment in since if moment is not None), default=None), tried)
 
     def _stuck(self) -> ColumnElement[bool]:
         """Return the SQL condition of a stuck visit.
@@ -137,22 +137,22 @@ class UploadQueue:
         """
         now = schema.utc_text(self.clock.wall())
         with storage_errors(), Session(schema.for_writing(self.engine)) as session, session.begin():
-            for one in which:
-                row = _attempt_row(session, one)
+            for entry in which:
+                row = _attempt_row(session, entry)
                 row.tries = row.tries + 1
                 row.error = error.code
                 row.message = error.message
                 row.failing_since = row.failing_since or now
 
-    def record_success(self, one: QueuedVisit, receipt: UploadReceipt) -> None:
-        """Record a confirmed upload of a visit as finished at `one.finished_at`, and clear its error.
+    def record_success(self, entry: QueuedVisit, receipt: UploadReceipt) -> None:
+        """Record a confirmed upload of a visit as finished at `entry.finished_at`, and clear its error.
 
         A visit that was finished again meanwhile stays in the queue.
         """
         now = self.clock.wall()
-        finish = schema.utc_text(one.finished_at)
+        finish = schema.utc_text(entry.finished_at)
         with storage_errors(), recorded(self.engine) as session:
-            row = _attempt_row(session, one)
+            row = _attempt_row(session, entry)
             row.tries = row.tries + 1
             row.error = None
             row.message = None
@@ -160,7 +160,7 @@ class UploadQueue:
             row.sent_at = schema.utc_text(now)
             row.sha256 = receipt.sha256
             row.confirmed = receipt.confirmed
-            session.execute(update(VisitRow).where(VisitRow.id == one.visit).values(sent=finish))
+            session.execute(update(VisitRow).where(VisitRow.id == entry.visit).values(sent=finish))
 
     def clear_errors(self, visit: str | None) -> None:
         """Clear code and text of the last error of one visit in the queue (None: of all), so that it is tried again."""
@@ -184,7 +184,9 @@ def _waiting(visit: VisitRow, upload: UploadRow | None, stuck: bool | None) -> Q
         row_validation.one_of(visit.finished_at, schema.utc_text(finished_at))
         if upload is None:
             return QueuedVisit(id, number, finished_at)
-        error, message = (None if one is None else row_validation.text(one) for one in (upload.error, upload.message))
+        error, message = (
+            None if value is None else row_validation.text(value) for value in (upload.error, upload.message)
+        )
         since = _failing_since(upload.failing_since)
         return QueuedVisit(id, number, finished_at, upload.tries, since, error, message, stuck=bool(stuck))
 
@@ -194,12 +196,12 @@ def _failing_since(value: object) -> datetime | None:
         return None if value is None else row_validation.timestamp(value)
 
 
-def _attempt_row(session: Session, one: QueuedVisit) -> UploadRow:
+def _attempt_row(session: Session, entry: QueuedVisit) -> UploadRow:
     """Return the row of `uploads` of (visit, finish time); add one with 0 tries to the transaction if missing."""
-    finish = schema.utc_text(one.finished_at)
-    row = session.get(UploadRow, (one.visit, finish))
+    finish = schema.utc_text(entry.finished_at)
+    row = session.get(UploadRow, (entry.visit, finish))
     if row is None:
-        row = UploadRow(visit=one.visit, finished_at=finish, tries=0)
+        row = UploadRow(visit=entry.visit, finished_at=finish, tries=0)
         session.add(row)
     return row
 
@@ -208,8 +210,8 @@ def _with_sizes(session: Session, found: Sequence[QueuedVisit]) -> list[QueuedVi
     query = (
         select(CaptureSlotRow.visit, func.sum(FileRow.bytes))
         .join(FileRow, FileRow.capture_id == CaptureSlotRow.capture)
-        .where(CaptureSlotRow.visit.in_([one.visit for one in found]), FileRow.name.in_(UPLOADED_FILES))
+        .where(CaptureSlotRow.visit.in_([entry.visit for entry in found]), FileRow.name.in_(UPLOADED_FILES))
         .group_by(CaptureSlotRow.visit)
     )
     sizes = {visit: int(size) for visit, size in session.execute(query)}
-    return [replace(one, size_bytes=sizes.get(one.visit, 0)) for one in found]
+    return [replace(entry, size_bytes=sizes.get(entry.visit, 0)) for entry in found]

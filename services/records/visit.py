@@ -62,8 +62,8 @@ class SlotState:
         Without a decision: the newest good capture, else the newest of all, None without captures.
         """
         if self.decision is not None:
-            return next((one for one in self.captures if one.capture == self.decision.capture), None)
-        return max(enumerate(self.captures), key=lambda one: (one[1].is_good, one[0]), default=(0, None))[1]
+            return next((taken for taken in self.captures if taken.capture == self.decision.capture), None)
+        return max(enumerate(self.captures), key=lambda pair: (pair[1].is_good, pair[0]), default=(0, None))[1]
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,9 @@ class Visit:
 
         None if every capture is in colour: a visit is shown in colour as a whole, or not at all.
         """
-        codes = [one.no_colour for slot in self.slots.values() for one in slot.captures if one.no_colour is not None]
+        codes = [
+            taken.no_colour for slot in self.slots.values() for taken in slot.captures if taken.no_colour is not None
+        ]
         return next((code for code in codes if code != GREEN_ONLY), codes[0] if codes else None)
 
 
@@ -110,10 +112,10 @@ def no_colour_of(method: str, channels: Sequence[ChannelUse]) -> str | None:
 
     `method`, `channels`: of its report.
     """
-    others = [one for one in channels if one.name != "green" and not one.predicted]
-    if method == NO_METHOD or any(one.reason is None for one in others):
+    others = [channel for channel in channels if channel.name != "green" and not channel.predicted]
+    if method == NO_METHOD or any(channel.reason is None for channel in others):
         return None
-    return next((one.code or GREEN_ONLY for one in others), GREEN_ONLY)
+    return next((channel.code or GREEN_ONLY for channel in others), GREEN_ONLY)
 
 
 def decision_after(slot: SlotState, new: SlotCapture) -> SlotDecision | None:

@@ -71,7 +71,7 @@ def _slot_document(slot: SlotState) -> SlotDocument:
     return SlotDocument(
         state=slot.state,
         capture=chosen.capture if chosen else None,
-        captures=[one.capture for one in slot.captures],
+        captures=[taken.capture for taken in slot.captures],
         verdict=chosen.verdict if chosen else None,
         reason=slot.decision.reason if slot.decision else None,
         tries=len(slot.captures),

@@ -158,7 +158,7 @@ class VisitPictures:
             if old_decision is not None and old_decision.capture == capture:
                 # The remaining captures of that eye determine its chosen one.
                 visit_rows.decide(session, shot.visit, from_slot, None)
-            verdict = next((one.verdict for one in before[from_slot].captures if one.capture == capture), None)
+            verdict = next((taken.verdict for taken in before[from_slot].captures if taken.capture == capture), None)
             visit_rows.decide(session, shot.visit, to.id, decision_after(before[to.id], SlotCapture(capture, verdict)))
             laterality_correction.relabel(session, shot, to, self._clock.wall(), by)
             return shot.visit

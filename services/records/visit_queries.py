@@ -110,7 +110,8 @@ def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) 
             refuse_changed("visit", row, contents[row.id])
             slots = {
                 slot.id: SlotState(
-                    tuple(_taken_capture(*one) for one in taken[row.id, slot.id]), _choice(decided, row, slot.id)
+                    tuple(_taken_capture(*columns) for columns in taken[row.id, slot.id]),
+                    _choice(decided, row, slot.id),
                 )
                 for slot in protocol.slots
             }
@@ -182,8 +183,10 @@ def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, s
         if field.visit in out:  # a damaged row may differ from the index
             out[field.visit][field.name] = field.value
     known: dict[str, dict[str, str]] = defaultdict(dict)
-    for one in session.scalars(select(IdentifierRow).where(IdentifierRow.patient.in_({row.patient for row in rows}))):
-        known[one.patient][one.name] = one.value
+    for identifier in session.scalars(
+        select(IdentifierRow).where(IdentifierRow.patient.in_({row.patient for row in rows}))
+    ):
+        known[identifier.patient][identifier.name] = identifier.value
     return {row.id: out[row.id] | known[row.patient] for row in rows}
 
 

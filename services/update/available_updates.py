@@ -43,7 +43,7 @@ class AvailableUpdates:
     def on_drives(self) -> list[FoundUpdate]:
         """Return the updates on USB drives and in the upload; `trouble` is the reason why one cannot be installed."""
         there = sources.list_bundles(self._settings.sticks, self._settings.tablet)
-        return [self._assessed(one, path) for one, path in there]
+        return [self._assessed(found, path) for found, path in there]
 
     def fetch(self, place: Path | None, progress: Progress) -> Path:
         """Copy or download a bundle and return its path.

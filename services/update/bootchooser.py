@@ -105,7 +105,7 @@ class BootChooser:
         Length and sector stay the same, so that the file names a working slot after a power cut.
         """
         choice = self._choice()
-        now, next_try = (str(PARTITIONS[one]).encode() for one in (slot, other(slot)))
+        now, next_try = (str(PARTITIONS[name]).encode() for name in (slot, other(slot)))
         descriptor = os.open(self.autoboot, os.O_WRONLY)
         try:
             os.pwrite(descriptor, choice[1] + now + choice[3] + next_try + choice[5], 0)

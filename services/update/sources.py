@@ -60,8 +60,8 @@ def list_bundles(sticks: Path, tablet: Path) -> list[tuple[FoundUpdate, Path]]:
         if stat.S_ISREG(status.st_mode) and not path.parent.is_symlink():
             id = hashlib.sha256(os.fsencode(path) + f" {status.st_size} {status.st_mtime_ns}".encode()).hexdigest()[:16]
             stick = _printable(path.parent.name) if where == "stick" else ""
-            one = {"id": id, "where": where, "stick": stick, "name": _printable(path.name), "bytes": status.st_size}
-            found.append((FoundUpdate.model_validate(one), path))
+            entry = {"id": id, "where": where, "stick": stick, "name": _printable(path.name), "bytes": status.st_size}
+            found.append((FoundUpdate.model_validate(entry), path))
     return found[:MAX_LISTED]
 
 

@@ -450,7 +450,7 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         EXAM,
-        "            requests.remember(one.press)\n",
+        "            requests.remember(resumption.press)\n",
         "            pass\n",
         f"{T_INTERRUPTED}::test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key",
     ),

@@ -66,7 +66,7 @@ def captures_router(store: CaptureStore, arbiter: HeadArbiter) -> APIRouter:
 
         At most `limit` captures; `before` is the id of the last one of the previous page.
         """
-        return CaptureList(captures=[capture_answer(one) for one in store.captures(limit, before)])
+        return CaptureList(captures=[capture_answer(record) for record in store.captures(limit, before)])
 
     @router.get("/api/captures/{id}")
     def capture(id: str) -> CaptureAnswer:

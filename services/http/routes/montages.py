@@ -43,15 +43,15 @@ def montage_router(repository: VisitRepository, montages: MontageMaker) -> APIRo
     return router
 
 
-def montage_answer(one: VisitMontage) -> MontageAnswer:
+def montage_answer(montage: VisitMontage) -> MontageAnswer:
     """Return the state of a montage and the places of its pictures."""
-    placed = one.made.placed if one.made is not None else ()
+    placed = montage.made.placed if montage.made is not None else ()
     return MontageAnswer(
-        state=one.state,
-        digest=one.digest,
-        pictures=len(one.pictures),
-        problem=error_text(one.problem),
-        projection=None if one.made is None else one.made.projection,
+        state=montage.state,
+        digest=montage.digest,
+        pictures=len(montage.pictures),
+        problem=error_text(montage.problem),
+        projection=None if montage.made is None else montage.made.projection,
         placed=[
             PlacedPicture(
                 index=at.index,
@@ -64,6 +64,6 @@ def montage_answer(one: VisitMontage) -> MontageAnswer:
                 overlap=at.overlap,
                 reason=at.reason,
             )
-            for taken, at in zip(one.pictures, placed, strict=False)
+            for taken, at in zip(montage.pictures, placed, strict=False)
         ],
     )

@@ -93,12 +93,14 @@ def status_answer(
         shape=head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
         field_px=2 * radius_px if radius_px < float("inf") else None,
         version=VERSION,
-        swept=[InterruptedCaptureAnswer.model_validate(one) for one in interrupted_captures(arbiter, repository)],
+        swept=[
+            InterruptedCaptureAnswer.model_validate(capture) for capture in interrupted_captures(arbiter, repository)
+        ],
         space_left=store.space.captures_left(),
         people_left=store.space.visits_left(len(repository.protocol.slots)),
         controller=lease.holder,
         problem=problem_body(problem) if problem else None,
         standing=[AlertAnswer.model_validate(alert) for alert in alerts.active_alerts()],
         sending=UploadCountsAnswer.model_validate(upload_worker.counts()) if upload_worker is not None else None,
-        notices=[one.remedy for one in arbiter.findings if not one.ok and not is_age_warning(one)],
+        notices=[finding.remedy for finding in arbiter.findings if not finding.ok and not is_age_warning(finding)],
     )

@@ -44,7 +44,7 @@ def _finished(run: TrialLensOutcome) -> TrialLensAnswer:
         vertex_mm=run.bench.vertex_mm,
         eye_dpt=run.bench.eye.m_dpt,
         rows=_rows(run.bench, run.readings, None, () if fit is None else fit.residuals_dpt),
-        findings=[] if fit is None else [FindingAnswer.model_validate(one) for one in fit.findings],
+        findings=[] if fit is None else [FindingAnswer.model_validate(finding) for finding in fit.findings],
         offset=None if fit is None else LensPower.model_validate(fit.offset),
         error=error_text(run.failure),
         stored_id=None if stored is None else stored.calibration.id,

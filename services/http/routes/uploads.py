@@ -41,24 +41,24 @@ def queue_answer(sender: UploadWorker | None) -> QueueAnswer:
     """Return the upload queue, at most `MAX_LISTED` visits; empty without a `sender`."""
     if sender is None:
         return QueueAnswer(configured=False, sent=0, waiting=0, next_try_s=0.0, visits=[])
-    visits = [_waiting_visit(one) for one in sender.queue.queued(MAX_LISTED, sizes=True)]
+    visits = [_waiting_visit(entry) for entry in sender.queue.queued(MAX_LISTED, sizes=True)]
     counts = sender.counts()
     return QueueAnswer(
         configured=True, sent=counts.sent, waiting=counts.waiting, next_try_s=round(sender.backoff_s, 1), visits=visits
     )
 
 
-def _waiting_visit(one: QueuedVisit) -> WaitingVisit:
+def _waiting_visit(entry: QueuedVisit) -> WaitingVisit:
     error = None
-    if one.error:
-        error = ErrorText(code=one.error, message=one.message or "", remedy=REMEDIES.get(one.error, ""))
+    if entry.error:
+        error = ErrorText(code=entry.error, message=entry.message or "", remedy=REMEDIES.get(entry.error, ""))
     return WaitingVisit(
-        visit=one.visit,
-        number=one.number,
-        since=one.finished_at,
-        size_bytes=one.size_bytes,
-        tries=one.tries,
-        failing_since=one.failing_since,
+        visit=entry.visit,
+        number=entry.number,
+        since=entry.finished_at,
+        size_bytes=entry.size_bytes,
+        tries=entry.tries,
+        failing_since=entry.failing_since,
         error=error,
-        stuck=one.stuck,
+        stuck=entry.stuck,
     )

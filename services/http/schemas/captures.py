@@ -121,19 +121,19 @@ def capture_answer(capture: Capture) -> CaptureAnswer:
         verdict=report.verdict,
         files=capture.files,
         links=links,
-        versions=[_version(one, capture.files, at) for one in report.versions] or None,
+        versions=[_version(version, capture.files, at) for version in report.versions] or None,
     )
 
 
-def _version(one: CaptureVersion, files: Mapping[str, str], at: str) -> VersionAnswer:
+def _version(version: CaptureVersion, files: Mapping[str, str], at: str) -> VersionAnswer:
     """Return a version of a capture whose files are below the URL `at`."""
     return VersionAnswer(
-        number=one.number,
-        result=one.result,
-        at=one.at,
-        method=one.method,
-        software=one.software,
-        picture=f"{at}/{one.picture}",
-        colour=f"{at}/{one.colour}" if one.colour in files else None,
-        report=f"{at}/{one.report}",
+        number=version.number,
+        result=version.result,
+        at=version.at,
+        method=version.method,
+        software=version.software,
+        picture=f"{at}/{version.picture}",
+        colour=f"{at}/{version.colour}" if version.colour in files else None,
+        report=f"{at}/{version.report}",
     )
