@@ -24,6 +24,7 @@ from services.instrument.exam_state import WireState
 from services.instrument.progress import Progress
 from services.instrument.record_origin import CaptureOrigin
 from services.instrument.resumption import ResumedTarget, refuse_targets, resumed_presses
+from services.instrument.shutter_button import ShutterButton
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import Watchdog
 from services.records.capture import BUDGET_S, Capture
@@ -75,6 +76,7 @@ class ExamService:
             budget_s,
             requests,
             ExamEvents(event_bus, watchdog, self.progress, requests),
+            ShutterButton(head.button, event_bus),
             self.capture_journal,
             self.calibration_monitor,
             resumed,

@@ -92,10 +92,6 @@ class ExamEvents:
             self._published_aim = aim
             self._event_bus.publish("aim", **asdict(aim))
 
-    def button(self) -> None:
-        """Publish a press of the button on the handle."""
-        self._event_bus.publish("button")
-
     def preview(self, jpeg: bytes, exposed_s: float, aim: Aim) -> None:
         """Show the next live picture."""
         number = self.output.preview.number + 1

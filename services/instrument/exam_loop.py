@@ -64,6 +64,7 @@ class ExamParts:
     budget_s: Callable[[], float]
     requests: ExamRequests
     events: ExamEvents
+    button: ShutterButton
     capture_journal: CaptureJournal
     calibration_monitor: CalibrationMonitor
     resumed: tuple[ResumedPress, ...] = ()
@@ -80,7 +81,6 @@ class ExamLoop:
         self._requests = parts.requests
         self._events = parts.events
         self._pipeline = pipeline
-        self._button = ShutterButton(parts.head.button, parts.events)
         self._live = LivePictures(
             parts.head,
             parts.clock,
@@ -88,7 +88,7 @@ class ExamLoop:
             parts.requests,
             parts.events,
             parts.store.refuse_light_in_vain,
-            self._button,
+            parts.button,
         )
         self._exposed: deque[ExposedCapture] = deque()
         self._resumed = deque(parts.resumed)
@@ -103,7 +103,7 @@ class ExamLoop:
     def step(self, now: ExamSnapshot) -> bool:
         """Run the most urgent action in the state `now`; return whether there was one."""
         self._parts.watchdog.beat()
-        self._button.poll()
+        self._parts.button.poll()
         if now.has_press:
             self._expose_pending()
         elif self._exposed:

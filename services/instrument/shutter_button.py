@@ -4,7 +4,7 @@ import logging
 
 from device.errors import BusFault
 from device.ports import Button
-from services.instrument.exam_events import ExamEvents
+from services.instrument.events import EventBus
 
 log = logging.getLogger(__name__)
 
@@ -15,8 +15,8 @@ class ShutterButton:
     The page sends the press, since it knows visit and slot, and holds the control lease.
     """
 
-    def __init__(self, button: Button | None, events: ExamEvents) -> None:
-        self._button, self._events = button, events
+    def __init__(self, button: Button | None, event_bus: EventBus) -> None:
+        self._button, self._event_bus = button, event_bus
         self._since_s: float | None = None
         self._is_silent = False
 
@@ -33,5 +33,5 @@ class ShutterButton:
             return
         self._is_silent = False
         if since_s is not None and since_s != self._since_s:
-            self._events.button()
+            self._event_bus.publish("button")
         self._since_s = since_s

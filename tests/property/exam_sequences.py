@@ -66,6 +66,7 @@ from services.instrument.exam_state import ExamState
 from services.instrument.frame_feedback import NO_AIM
 from services.instrument.progress import Progress
 from services.instrument.resumption import resumed_presses
+from services.instrument.shutter_button import ShutterButton
 from services.instrument.watchdog import Watchdog
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
@@ -340,6 +341,7 @@ class Run:
             lambda: BUDGET_S,
             self.requests,
             ExamEvents(self.event_bus, watchdog, progress, self.requests),
+            ShutterButton(head.button, self.event_bus),
             journal,
             monitor,
             resumed,

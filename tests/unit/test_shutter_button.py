@@ -5,19 +5,14 @@ from device.config.head_file import load_head
 from device.sim.chips import SimButton
 from device.sim.world import World
 from services.instrument.events import EventBus
-from services.instrument.exam_events import ExamEvents
-from services.instrument.exam_requests import ExamRequests
-from services.instrument.progress import Progress
 from services.instrument.shutter_button import ShutterButton
-from services.instrument.watchdog import Watchdog
 from services.resources import HEADS
 
 
 def test_each_press_is_published_once() -> None:
     clock, bus = VirtualClock(), EventBus()
     world = World(load_head(HEADS / "sim.toml"), clock)
-    events = ExamEvents(bus, Watchdog(None), Progress(clock, 0.1, lambda: 0.26), ExamRequests(clock))
-    button = ShutterButton(SimButton(world), events)
+    button = ShutterButton(SimButton(world), bus)
 
     def after(pressed_since_s: float | None) -> int:
         world.pressed_since_s = pressed_since_s
@@ -32,7 +27,6 @@ def test_each_press_is_published_once() -> None:
 
 
 def test_a_head_without_a_button_publishes_nothing() -> None:
-    clock, bus = VirtualClock(), EventBus()
-    events = ExamEvents(bus, Watchdog(None), Progress(clock, 0.1, lambda: 0.26), ExamRequests(clock))
-    ShutterButton(None, events).poll()
+    bus = EventBus()
+    ShutterButton(None, bus).poll()
     assert not bus.history
