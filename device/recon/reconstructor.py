@@ -554,8 +554,8 @@ class Reconstructor:
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }
-        if isinstance(eye, Refraction) and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
-            warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
+        if isinstance(eye, Refraction) and (abs(eye.m_dpt) > 8 or eye.sd_dpt > 0.5):
+            warnings += (f"The refraction of {-eye.m_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         return Report(
             method=recipe.method,
             bin=recipe.bin,

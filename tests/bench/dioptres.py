@@ -72,5 +72,5 @@ def refracted(spec: InstrumentSpec, found: Calibration, planner: Planner) -> flo
         with SimLight(world).on(Illumination(spec.light.colour)):
             frame = camera.expose(shot).counts.copy()
         seen = refractor.find(frame, camera.expose(shot).counts)
-        errors.append(seen.sphere_dpt - m_dpt if isinstance(seen, Refraction) else np.nan)
+        errors.append(seen.m_dpt - m_dpt if isinstance(seen, Refraction) else np.nan)
     return float(np.sqrt(np.mean(np.square(errors))))

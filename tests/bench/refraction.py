@@ -451,8 +451,8 @@ def judge_bursts(seed: int, count: int, data: Path) -> bool:
                 if accommodation_dpt == 0:
                     alarms.append(whole.scatter.chi2 > CHI2_OF_ONE_PERCENT)
                 print(
-                    f"{name} light {case.light:g}: error of the first {-first.sphere_dpt - spheres_dpt[0]:+.3f} (sd "
-                    f"{first.sd_dpt:.3f}), of the burst {-whole.sphere_dpt - spheres_dpt.mean():+.3f} (sd "
+                    f"{name} light {case.light:g}: error of the first {-first.m_dpt - spheres_dpt[0]:+.3f} (sd "
+                    f"{first.sd_dpt:.3f}), of the burst {-whole.m_dpt - spheres_dpt.mean():+.3f} (sd "
                     f"{whole.sd_dpt:.3f}) dpt; scatter true {np.std(spheres_dpt, ddof=1):.3f}, found "
                     f"{whole.scatter.sd_dpt:.3f} dpt, chi2 {whole.scatter.chi2:.1f}",
                     flush=True,

@@ -37,7 +37,7 @@ class Cell:
     method minus it. Both are None if the frame was refused with the message `refused`, or if the solver `crashed` with
     the exception text `refused`. `warnings` are the messages with the picture, `quality` its quality figures.
     `sphere_dpt` with `sd_dpt` is the estimated, `true_dpt` the true spectacle correction (negative: myopia), relative
-    to the eye of the PSF: minus `Refraction.sphere_dpt`. None: not estimated, or undefined for the frame.
+    to the eye of the PSF: minus `Refraction.m_dpt`. None: not estimated, or undefined for the frame.
     """
 
     eye: str

@@ -100,7 +100,7 @@ class Bench:
             eye = refractor.add_cylinder(eye)
         if not isinstance(eye, Refraction) or eye.cylinder is None:
             return (float("nan"),) * 3
-        return eye.sphere_dpt, eye.cylinder.j0_dpt, eye.cylinder.j45_dpt
+        return eye.m_dpt, eye.cylinder.j0_dpt, eye.cylinder.j45_dpt
 
     def tikhonov(self, take: "SimulatedFrame", mu: float) -> Image:
         """Return the paper's solution for one weight mu, on the samples of the scores."""

@@ -132,11 +132,11 @@ def test_little_light_does_not_shift_the_refraction(dim: World, of_dim: Refracti
     found = [refined(of_dim, dim_counts(dim, seed)) for seed in range(8)]
     sd_dpt = float(np.mean([one.sd_dpt for one in found]))
     # 2.5: the mean of eight frames is beyond it once in a hundred times
-    assert abs(np.mean([one.sphere_dpt for one in found])) < 2.5 * sd_dpt / np.sqrt(len(found))
+    assert abs(np.mean([one.m_dpt for one in found])) < 2.5 * sd_dpt / np.sqrt(len(found))
 
 
 def test_whole_numbers_in_a_float_frame_are_rounded_counts(dim: World, of_dim: RefractionEstimator) -> None:
     """A frame with missing pixels is a float frame; its dark samples are read as 0 all the same."""
     counts = dim_counts(dim, 0)
     whole, rounded = refined(of_dim, counts), refined(of_dim, counts.astype(np.float32))
-    assert (rounded.sphere_dpt, rounded.sd_dpt) == pytest.approx((whole.sphere_dpt, whole.sd_dpt), abs=1e-6)
+    assert (rounded.m_dpt, rounded.sd_dpt) == pytest.approx((whole.m_dpt, whole.sd_dpt), abs=1e-6)

@@ -77,7 +77,7 @@ def test_sphere_and_field_edge_are_found_together(estimator: RefractionEstimator
     """With the calibrated edge an edge that is 0.2 deg too large costs 0.8 dpt, and one soft over 1 deg more."""
     found = estimator.find(expose(Prescription(-2.5), edge))
     assert isinstance(found, Refraction)
-    assert abs(found.sphere_dpt - 2.5) < 3 * found.sd_dpt
+    assert abs(found.m_dpt - 2.5) < 3 * found.sd_dpt
     assert found.sd_dpt < 0.35
     assert found.edge.diameter_deg == pytest.approx(edge.diameter_deg, abs=0.1)
     assert (found.edge.right_deg, found.edge.down_deg) == pytest.approx((edge.right_deg, edge.down_deg), abs=0.06)
@@ -129,7 +129,7 @@ def test_frames_of_one_eye_scatter_within_their_sd(estimator: RefractionEstimato
     assert (whole.scatter.count, whole.scatter.stated_sd_dpt) == (4, first.sd_dpt)
     assert 0 < whole.scatter.chi2 < CHI2_OF_ONE_PERCENT
     assert whole.sd_dpt == max(first.sd_dpt, whole.scatter.sd_dpt)
-    assert abs(whole.sphere_dpt + SPHERE_DPT) < 3 * first.sd_dpt
+    assert abs(whole.m_dpt + SPHERE_DPT) < 3 * first.sd_dpt
     assert estimator.join(first, burst[:2], None) == first, "two frames have no scatter"
 
 
@@ -144,8 +144,8 @@ def test_an_eye_that_accommodates_between_the_frames_has_the_sd_of_its_scatter(
     assert whole.scatter is not None
     assert whole.scatter.chi2 > 3 * CHI2_OF_ONE_PERCENT
     assert whole.sd_dpt == whole.scatter.sd_dpt == pytest.approx(float(np.std(spheres_dpt, ddof=1)), rel=0.2)
-    assert whole.sphere_dpt == pytest.approx(-np.mean(spheres_dpt), abs=0.1)
-    assert abs(first.sphere_dpt - whole.sphere_dpt) > 0.1
+    assert whole.m_dpt == pytest.approx(-np.mean(spheres_dpt), abs=0.1)
+    assert abs(first.m_dpt - whole.m_dpt) > 0.1
 
 
 def test_frames_with_too_different_refractions_are_refused(estimator: RefractionEstimator, first: Refraction) -> None:

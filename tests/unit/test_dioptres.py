@@ -18,8 +18,8 @@ from device.calibration.procedure.dioptres import (
     PsfSimilarity,
     fit_dioptre_scale,
     fit_similarity,
+    mean_sphere_dpt,
     refuse_wrong_position,
-    sphere_dpt,
 )
 from device.clock import VirtualClock
 from device.errors import CalibrationRefused
@@ -132,13 +132,15 @@ def test_another_source_is_refused_by_its_correlation() -> None:
     found = fit_similarity(Psf(speckle((120, 128), 1, 2.0)), Psf(speckle((120, 128), 2, 2.0)), 10.0)
     with pytest.raises(CalibrationRefused, match="correlation 0"):
         refuse_wrong_position(found, 2.0, 25.0, GEOMETRY)
-    refuse_wrong_position(PsfSimilarity(1 - 0.003375 * sphere_dpt(2.0, 25.0), (0.0, 0.0), 0.99), 2.0, 25.0, GEOMETRY)
+    refuse_wrong_position(
+        PsfSimilarity(1 - 0.003375 * mean_sphere_dpt(2.0, 25.0), (0.0, 0.0), 0.99), 2.0, 25.0, GEOMETRY
+    )
 
 
 def test_sphere_matches_the_screen_positions_of_the_paper() -> None:
     """-5.5 and +7.6 dpt of spectacle correction at +-4 mm (paper, "Refractive error"); M has the other sign."""
-    assert sphere_dpt(4, 25) == pytest.approx(5.517, abs=1e-3)
-    assert sphere_dpt(-4, 25) == pytest.approx(-7.619, abs=1e-3)
+    assert mean_sphere_dpt(4, 25) == pytest.approx(5.517, abs=1e-3)
+    assert mean_sphere_dpt(-4, 25) == pytest.approx(-7.619, abs=1e-3)
 
 
 def test_a_single_position_is_refused() -> None:

@@ -77,7 +77,7 @@ def test_a_good_head_passes_with_any_eye(retina: int, m_dpt: float, record_prope
     assert set(findings) == {"age", "psf", "shift", "width", "hot pixels", "black level", "dark noise"}
     assert all(one.ok and not one.remedy for one in findings.values())
     assert seen[0].statement is not None
-    assert seen[0].statement.sphere_dpt == pytest.approx(m_dpt, abs=0.4)
+    assert seen[0].statement.m_dpt == pytest.approx(m_dpt, abs=0.4)
 
 
 RETINA_SCENES = (

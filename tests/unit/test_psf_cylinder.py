@@ -156,7 +156,7 @@ def test_a_cylinder_in_doubt_is_not_used(found: Cylinder, is_used: bool) -> None
 
 
 def test_a_cylinder_alone_needs_its_psf_and_no_refraction_the_stored_one() -> None:
-    plane = replace(refraction(cylinder()), sphere_dpt=0.01)
+    plane = replace(refraction(cylinder()), m_dpt=0.01)
     assert plane.psf_wavefront == Wavefront(0.01, EYE.j0_dpt, EYE.j45_dpt)
     assert replace(plane, cylinder=cylinder(0.1, 0.0)).psf_wavefront is None
 

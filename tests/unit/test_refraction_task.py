@@ -32,23 +32,23 @@ class Estimator:
         return Refraction(float(counts[0, 0]), 0.1, 1.0, 500.0, (), EDGE, 0.0)
 
     def add_cylinder(self, found: Refraction) -> Refraction:
-        self.calls.append(("cylinder", found.sphere_dpt))
+        self.calls.append(("cylinder", found.m_dpt))
         return found
 
     def join(self, found: Refraction, frames: Any, dark: Any) -> Refraction:
-        self.calls.append(("join", found.sphere_dpt))
-        return replace(found, sphere_dpt=float(np.mean([counts[0, 0] for counts in frames])))
+        self.calls.append(("join", found.m_dpt))
+        return replace(found, m_dpt=float(np.mean([counts[0, 0] for counts in frames])))
 
 
-def begin(estimator: Any, lock: Lock, sphere_dpt: float, with_cylinder: bool = True) -> RefractionTask:
-    frame = np.full((2, 2), sphere_dpt, np.float32), None, None
+def begin(estimator: Any, lock: Lock, m_dpt: float, with_cylinder: bool = True) -> RefractionTask:
+    frame = np.full((2, 2), m_dpt, np.float32), None, None
     return RefractionTask(estimator, lock, SystemClock(), frame, with_cylinder)
 
 
-def sphere_dpt(task: RefractionTask) -> float:
+def m_dpt(task: RefractionTask) -> float:
     found = task.whole()
     assert isinstance(found, Refraction)
-    return found.sphere_dpt
+    return found.m_dpt
 
 
 def test_the_cylinder_follows_its_own_search_also_with_other_tasks_waiting() -> None:
@@ -56,7 +56,7 @@ def test_the_cylinder_follows_its_own_search_also_with_other_tasks_waiting() -> 
     tasks = [begin(estimator, lock, dpt) for dpt in (1.0, 2.0, 3.0)]
     assert not any(task.is_done for task in tasks)
     estimator.go.set()
-    assert [sphere_dpt(task) for task in tasks] == [1.0, 2.0, 3.0]
+    assert [m_dpt(task) for task in tasks] == [1.0, 2.0, 3.0]
     pairs = [tuple(estimator.calls[k : k + 2]) for k in (0, 2, 4)]
     assert sorted(pairs) == [(("find", dpt), ("cylinder", dpt)) for dpt in (1.0, 2.0, 3.0)]
 
@@ -68,11 +68,11 @@ def test_other_frames_join_after_the_cylinder_and_do_not_hold_it_back() -> None:
     task.join([np.full((2, 2), 4.0, np.float32)])
     other = begin(estimator, lock, 2.0)
     estimator.go.set()
-    assert sphere_dpt(other) == 2.0
-    assert sphere_dpt(task) == 2.5
+    assert m_dpt(other) == 2.0
+    assert m_dpt(task) == 2.5
     latest = task.latest()
     assert isinstance(latest, Refraction)
-    assert (latest.sphere_dpt, task.is_done) == (2.5, True)
+    assert (latest.m_dpt, task.is_done) == (2.5, True)
     assert estimator.calls.index(("cylinder", 1.0)) < estimator.calls.index(("join", 1.0))
     refused = begin(estimator, lock, 0.0)
     refused.join([np.full((2, 2), 4.0, np.float32)])

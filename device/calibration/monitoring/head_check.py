@@ -78,7 +78,7 @@ class ReportedRefraction:
     """
 
     taken_at: datetime
-    sphere_dpt: float
+    m_dpt: float
     field_deg: float
     field_deg_sd: float
 
@@ -123,7 +123,7 @@ def check(
         found += _field_findings(fitting)
     sittings = _sittings(refractions)
     if len(sittings) >= MIN_SITTINGS:
-        found.append(_scale_finding([median(refraction.sphere_dpt for refraction in sitting) for sitting in sittings]))
+        found.append(_scale_finding([median(refraction.m_dpt for refraction in sitting) for sitting in sittings]))
     measured = [refraction for refraction in refractions if refraction.field_deg_sd > 0]
     if calibration.field_deg is not None and len(eyes := _sittings(measured)) >= MIN_EDGE_SITTINGS:
         found.append(_edge_finding(calibration.field_deg, eyes))

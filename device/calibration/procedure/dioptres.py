@@ -48,7 +48,7 @@ class DioptreScale:
     worst_dpt: float
 
 
-def sphere_dpt(moved_mm: float, eye_mm: float) -> float:
+def mean_sphere_dpt(moved_mm: float, eye_mm: float) -> float:
     """Return the mean sphere M, dpt, of a model eye (f = `eye_mm`), its point moved away; positive means myopia."""
     return 1000 / eye_mm - 1000 / (eye_mm + moved_mm)
 
@@ -97,11 +97,11 @@ def refuse_wrong_position(found: PsfSimilarity, moved_mm: float, eye_mm: float, 
     if sideways_deg > MAX_SIDEWAYS_DEG:
         message = f"at {moved_mm:+g} mm the source has moved sideways by {sideways_deg:.2f} degrees"
         raise CalibrationRefused(f"{message} (at most {MAX_SIDEWAYS_DEG})", REMEDY)
-    share = (1 - found.scale) / (geometry.nominal_scale_per_dpt * sphere_dpt(moved_mm, eye_mm))
+    share = (1 - found.scale) / (geometry.nominal_scale_per_dpt * mean_sphere_dpt(moved_mm, eye_mm))
     if not MIN_SHARE < share < MAX_SHARE:
         how = "the other way" if share < -MIN_SHARE / 2 else "too little" if share < MIN_SHARE else "too far"
         message = f"at {moved_mm:+g} mm the source has moved {how}: the PSF is stretched by {found.scale - 1:+.2%}"
-        wanted = -geometry.nominal_scale_per_dpt * sphere_dpt(moved_mm, eye_mm)
+        wanted = -geometry.nominal_scale_per_dpt * mean_sphere_dpt(moved_mm, eye_mm)
         raise CalibrationRefused(f"{message} where about {wanted:+.2%} are due", REMEDY)
 
 
@@ -111,7 +111,7 @@ def fit_dioptre_scale(scales: Mapping[float, float], eye_mm: float) -> DioptreSc
     The stored PSF is at position 0 with scale 1. An offset of the whole rail of 0.1 mm makes k wrong by 0.8 %.
     CalibrationRefused for fewer than two positions, or for one beside the line.
     """
-    spheres_dpt = np.array([sphere_dpt(moved_mm, eye_mm) for moved_mm in scales])
+    spheres_dpt = np.array([mean_sphere_dpt(moved_mm, eye_mm) for moved_mm in scales])
     shrunk = 1 - np.array(list(scales.values()))
     if len(scales) < 2 or np.ptp(spheres_dpt) == 0:
         raise CalibrationRefused(f"{len(scales)} places make no line", "Move the source to two places or more.")

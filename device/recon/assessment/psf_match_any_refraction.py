@@ -44,7 +44,7 @@ class PsfMatchResult:
         Match of frame and PSF, 1 for the PSF of the frame.
     sd
         Standard deviation of the score.
-    sphere_dpt
+    m_dpt
         Mean sphere M in dpt, positive for myopia; the report states the correction, of the other sign.
     field_offset_deg
         Displacement of the illuminated field's centre from the sensor's in degrees (down, right).
@@ -54,7 +54,7 @@ class PsfMatchResult:
 
     score: float
     sd: float
-    sphere_dpt: float
+    m_dpt: float
     field_offset_deg: tuple[float, float] | None
     field_radius_change_ratio: float | None
 
@@ -119,18 +119,18 @@ class PsfMatchTest:
             return likelihood.of_sphere(frame, smooth, noise, m_dpt)
 
         search = Search(lambda m_dpt: found(m_dpt).nats)
-        sphere_dpt = search.descend(search.grid_search(refractor.step_dpt), refractor.step_dpt / 4)
-        stray_dn = likelihood.residual(frame, smooth, transform(likelihood.geometry, sphere_dpt)).stray_dn
-        score, sd = self._score(_filled(frame.linear) - np.float32(stray_dn), found(sphere_dpt).power, noise)
+        m_dpt = search.descend(search.grid_search(refractor.step_dpt), refractor.step_dpt / 4)
+        stray_dn = likelihood.residual(frame, smooth, transform(likelihood.geometry, m_dpt)).stray_dn
+        score, sd = self._score(_filled(frame.linear) - np.float32(stray_dn), found(m_dpt).power, noise)
         if self._rim is None:
-            return PsfMatchResult(score, sd, sphere_dpt, None, None)
-        likelihood.model.refocus(likelihood.otf(likelihood.grid, sphere_dpt))
+            return PsfMatchResult(score, sd, m_dpt, None, None)
+        likelihood.model.refocus(likelihood.otf(likelihood.grid, m_dpt))
         edge = self._rim.fit(frame.linear.y, between)
         per_deg = refractor.geometry.px_per_deg / likelihood.grid.n
         return PsfMatchResult(
             score,
             sd,
-            sphere_dpt,
+            m_dpt,
             (edge.offset_samples[0] / per_deg, edge.offset_samples[1] / per_deg),
             edge.radius_change_ratio,
         )

@@ -25,6 +25,6 @@ def corrected(found: Refraction, offset: RefractionOffset | None) -> Refraction:
             cylinder.j45_dpt - offset.j45_dpt,
             hypot(cylinder.j45_sd_dpt, offset.j45_sd_dpt),
         )
-    sphere_dpt = found.sphere_dpt + offset.m_dpt
+    m_dpt = found.m_dpt + offset.m_dpt
     sd_dpt = hypot(found.sd_dpt, offset.m_sd_dpt)
-    return replace(found, sphere_dpt=sphere_dpt, sd_dpt=sd_dpt, cylinder=cylinder)
+    return replace(found, m_dpt=m_dpt, sd_dpt=sd_dpt, cylinder=cylinder)

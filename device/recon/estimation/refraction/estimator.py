@@ -89,7 +89,7 @@ class Refraction:
     before `join`.
     """
 
-    sphere_dpt: float
+    m_dpt: float
     sd_dpt: float
     psf_scale: float
     nats: float
@@ -103,15 +103,15 @@ class Refraction:
     def in_doubt(self) -> bool:
         """True if M alone does not call for another PSF: |M| < max(0.12 dpt, 2 sd); of a burst: sd of one frame."""
         sd_dpt = self.sd_dpt if self.scatter is None else self.scatter.stated_sd_dpt
-        return abs(self.sphere_dpt) < max(0.12, 2 * sd_dpt)
+        return abs(self.m_dpt) < max(0.12, 2 * sd_dpt)
 
     @property
     def psf_wavefront(self) -> Wavefront | None:
         """Wavefront of the PSF of the picture, with the cylinder if it is not in doubt; None for the stored PSF."""
         cylinder = self.cylinder
         if cylinder is not None and not cylinder.in_doubt:
-            return Wavefront(self.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt)
-        return None if self.in_doubt else Wavefront(self.sphere_dpt)
+            return Wavefront(self.m_dpt, cylinder.j0_dpt, cylinder.j45_dpt)
+        return None if self.in_doubt else Wavefront(self.m_dpt)
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ class RefractionEstimator:
         cylinder = found.cylinder
         if cylinder is None or len(frames) < MIN_FRAMES or not self._is_refined:
             return found
-        eye_dpt = np.array([found.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt])
+        eye_dpt = np.array([found.m_dpt, cylinder.j0_dpt, cylinder.j45_dpt])
         cleaned = [(counts, dark, self.defects(counts, dark)) for counts in frames]
         try:
             steps_dpt = self._refinement.steps(eye_dpt, found.edge, cleaned)
@@ -286,7 +286,7 @@ class RefractionEstimator:
         m_dpt, j0_dpt, j45_dpt = (eye_dpt + (steps_dpt - steps_dpt[0]).mean(axis=0)).tolist()
         return replace(
             found,
-            sphere_dpt=m_dpt,
+            m_dpt=m_dpt,
             sd_dpt=found.sd_dpt * scatter.growth,
             psf_scale=self.scale(m_dpt),
             cylinder=replace(cylinder, j0_dpt=j0_dpt, j45_dpt=j45_dpt),
@@ -299,7 +299,7 @@ class RefractionEstimator:
         return self._edges.grid.n * self.geometry.pitch_um <= MAX_SAMPLE_UM
 
     def _with_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
-        model = find_cylinder(self._edges, found.sphere_dpt, self._blocks)
+        model = find_cylinder(self._edges, found.m_dpt, self._blocks)
         if model is None:
             return NoRefraction("the likelihood has no clear minimum with a cylinder")
         sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
@@ -321,7 +321,7 @@ class RefractionEstimator:
         (sd_dpt, j0_sd_dpt, j45_sd_dpt) = sds_dpt.tolist()
         return replace(
             found,
-            sphere_dpt=m_dpt,
+            m_dpt=m_dpt,
             sd_dpt=sd_dpt,
             psf_scale=self.scale(m_dpt),
             edge=self._edges.field_edge(self._edges.edge_model(eye_dpt)),

@@ -55,13 +55,13 @@ def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]
     if isinstance(found, NoRefraction):
         return report | {"refused": found.reason}
     report |= {
-        "sphere": -found.sphere_dpt,
+        "sphere": -found.m_dpt,
         "sd": found.sd_dpt,
         "field_deg": found.edge.diameter_deg,
         "field_deg_sd": found.edge.diameter_sd_deg,
     }
     if (cylinder := found.cylinder) is not None:
-        lens = sphere_cylinder(-found.sphere_dpt, -cylinder.j0_dpt, cylinder.j45_dpt)
+        lens = sphere_cylinder(-found.m_dpt, -cylinder.j0_dpt, cylinder.j45_dpt)
         report |= {
             "j0": -cylinder.j0_dpt,
             "j0_sd": cylinder.j0_sd_dpt,
