@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from dataclasses import dataclass
 from threading import Lock
 
@@ -57,7 +57,7 @@ class EventBus:
         with self._lock:
             return tuple(self._events)
 
-    async def subscribe(self, after: int | None = None) -> AsyncIterator[Event]:
+    async def subscribe(self, after: int | None = None) -> AsyncGenerator[Event]:
         """Yield the events after number `after` (None: from now on) until `close`.
 
         A heartbeat (event `beat`, number 0) comes first and after each second without an event. If `after` exceeds the

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.assessment.metrics import fit_intensity
-from device.recon.colour import Colour, join_colours, register_colours
+from device.recon.colour import join_colours, register_colours
 from device.recon.estimation.registration import Shift
 from device.recon.model.grid import disc
 from device.recon.model.resampling import moved_back
 from device.recon.reconstructor import Reconstructor, default_schedule
-from device.values import Image
+from device.values import Colour, Image
 from tests.bench import timing
 from tests.bench.bursts import CLOCK, PLANNER, scored, scorer
 from tests.bench.colour_difference import ciede2000, lab

@@ -4,8 +4,9 @@ from collections.abc import Callable
 from functools import partial
 
 from device.clock import SystemClock
-from device.recon.model.fft_plans import Planner
+from device.recon.model.fft_plans import Planner, RealFft
 from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.solvers.tv import TotalVariation
 from device.sim.scene_files import SimulatedExposure
 from tests.bench import timing
 from tests.bench.peer_environment import peer
@@ -49,10 +50,11 @@ def rounds(scene: SimulatedExposure, planner: Planner) -> None:
         make = Reconstructor(scene.calibration, SHAPE, planner, SystemClock(), (recipe,), refract=False)
         make(scene.counts, rounds=1)
         shape = make.stages[0].grid.shape
-        one, other = make.stages[0].solver.data_fft, make.stages[0].solver.model.fft
+        solver = make.stages[0].solver
+        assert isinstance(solver, TotalVariation)
 
-        def pairs(one=one, other=other) -> None:
-            one.forward(), one.inverse(), other.forward(), other.inverse()
+        def pairs(data: RealFft = solver.data_fft, image: RealFft = solver.model.fft) -> None:
+            data.forward(), data.inverse(), image.forward(), image.inverse()
 
         (bare_ms, round_ms), (_, ratio) = timing.against_the_first(pairs, make.stages[0].solver.step)
         timing.row(f"two bare pairs, {shape[0]} x {shape[1]}", bare_ms, 1.0)

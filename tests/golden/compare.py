@@ -32,7 +32,7 @@ def difference(recorded: Any, present: Any, tolerance: float = 0.0) -> str:
     """
     present = _without_rounding(recorded, json.loads(json.dumps(present)), tolerance)
     texts = [as_text(one).splitlines() for one in (recorded, present)]
-    lines = list(difflib.unified_diff(*texts, "recorded", "present", lineterm="", n=2))
+    lines = list(difflib.unified_diff(texts[0], texts[1], "recorded", "present", lineterm="", n=2))
     more = [f"... and {len(lines) - MAX_LINES} lines more"] if len(lines) > MAX_LINES else []
     return "\n".join(lines[:MAX_LINES] + more)
 

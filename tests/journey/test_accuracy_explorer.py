@@ -98,7 +98,7 @@ def test_a_capture_is_reconstructed_by_another_method_and_marked_as_simulated(
     dark = raw_tiff(np.full_like(scene.counts, 64), RawMetadata())
     kept = StoredCapture(raw, dark, scene.calibration, simulated=True)
     picture = Image.open(BytesIO(explorer.reconstruct(kept, Recipe("gradient", 1))))
-    assert picture.text["simulated"] == "true"
+    assert picture.info["simulated"] == "true"
     assert np.asarray(picture).std() > 10
     with pytest.raises(SettingError, match="no method guess"):
         explorer.reconstruct(kept, Recipe("guess", 1))

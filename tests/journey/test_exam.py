@@ -76,7 +76,7 @@ def test_record_report_and_picture_are_marked_as_simulated(old_rig: Any) -> None
     assert json.loads(old_rig.store.read(kept.id, "report.json"))["simulated"] is True
     assert read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))[1].simulated is True
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
-        assert picture.text["simulated"] == "true"
+        assert picture.info["simulated"] == "true"
         corner = np.asarray(picture)[-12:, :40]
     assert corner.max() > 200  # letters of the mark on its black band
     assert (corner < 10).mean() > 0.3

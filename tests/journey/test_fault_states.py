@@ -184,11 +184,11 @@ def test_stage_events_estimate_the_seconds_left(make_rig: MakeRig) -> None:
             super().publish(kind, **data)
             if kind == "stage" and data["stage"] != "refine" and (data["id"], data["stage"]) not in left_s:
                 left_s[data["id"], data["stage"]] = data["left_s"]
-                rig.clock.sleep(1.0)
+                slow_rig.clock.sleep(1.0)
 
-    rig = make_rig(event_bus=SlowBus())
+    slow_rig = make_rig(event_bus=SlowBus())
     for _ in range(2):
-        rig.exam.press("OD").result(30)
+        slow_rig.exam.press("OD").result(30)
     assert list(left_s.values()) == pytest.approx([5.5, 5.0, 0.4, 3.5, 2.0, 1.0], abs=0.11)
 
 

@@ -9,7 +9,8 @@ import pytest
 
 from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
-from device.recon.white_balance import OVER_GREEN, RGB
+from device.recon.colour import RGB
+from device.recon.white_balance import OVER_GREEN
 from device.values import Colour, Illumination, Psf
 from services.imaging.picture_files import raw_tiff
 from services.imaging.raw_metadata import RawMetadata

@@ -178,9 +178,9 @@ def test_label_of_a_mosaic_is_believed_only_with_the_pixels_of_one(tmp_path: Pat
         assert made.report.bayer == label
         noted = any("labelled as a colour mosaic (bggr)" in warning for warning in made.report.warnings)
         assert noted == (given is None)
-    made = reconstruct_file(mono, options([caustic()])).picture
+    picture = reconstruct_file(mono, options([caustic()])).picture
     expected = reconstruct_file(scene(), options([caustic()])).picture
-    assert np.corrcoef(made.ravel(), expected.ravel())[0, 1] > 0.999
+    assert np.corrcoef(picture.ravel(), expected.ravel())[0, 1] > 0.999
     forced = reconstruct_file(mosaic, options([caustic()], bayer="none"))
     assert forced.picture.ndim == 2
     assert not any("mosaic" in warning for warning in forced.report.warnings)

@@ -102,7 +102,7 @@ def test_one_press_on_a_recording_gives_a_picture_that_is_not_marked(folder: Pat
     assert metadata.simulated is False
     assert np.array_equal(raw, read_image(folder / "raw.tiff"))
     with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
-        assert picture.text["simulated"] == "false"
+        assert picture.info["simulated"] == "false"
         assert picture.size == (160, 120)
         pixels = np.asarray(picture).astype(float)
     assert np.corrcoef(pixels.ravel(), spots().ravel())[0, 1] > 0.5
@@ -150,7 +150,7 @@ def test_a_recording_of_a_simulated_raw_stays_simulated(folder: Path, play: Play
     kept, exam = play(folder)
     assert kept.simulated is True
     with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
-        assert picture.text["simulated"] == "true"
+        assert picture.info["simulated"] == "true"
 
 
 def test_a_preview_of_a_recording_comes_too(folder: Path, play: Played) -> None:

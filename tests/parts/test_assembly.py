@@ -126,8 +126,8 @@ def test_block_is_wider_than_the_plate(d: Dimensions, head: Solids) -> None:
         assert common_mm3(lens + light, head[name]) < NOTHING_MM3, name
 
 
-def screws(d: Dimensions) -> dict[str, list[tuple[Manifold, str]]]:
-    """Return every screw as a rod of its own width, with the part that holds its thread."""
+def screws(d: Dimensions) -> dict[str, list[Manifold]]:
+    """Return every screw as a rod of its own width, by the part that it holds."""
     half, rear = d.bought.board_holes_mm / 2, d.cell_rear_z_mm
     x, y = diffuser_cell.SCREWS_MM
     deep = d.cell_front_z_mm - d.fit.insert_deep_mm + 0.1

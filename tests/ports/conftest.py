@@ -59,6 +59,13 @@ class Rig:
             self.light.close()
 
 
+@dataclass
+class SimRig(Rig):
+    """Simulated camera and lamp of one world."""
+
+    camera: SimCamera
+
+
 def small_head() -> InstrumentSpec:
     """Return the simulated head with sixteen times fewer, larger pixels."""
     spec = load_head(HEAD)
@@ -66,14 +73,14 @@ def small_head() -> InstrumentSpec:
     return spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)})
 
 
-def sim_rig() -> Rig:
+def sim_rig() -> SimRig:
     world = World(small_head(), VirtualClock())
-    return Rig(SimCamera(world), SimLight(world), world.clock)
+    return SimRig(SimCamera(world), SimLight(world), world.clock)
 
 
-def guarded_rig() -> Rig:
+def guarded_rig() -> SimRig:
     rig = sim_rig()
-    return Rig(
+    return SimRig(
         rig.camera, GuardedLight(rig.light, rig.clock, 30, hazard_of(small_head()), MemoryLedger(rig.clock)), rig.clock
     )
 

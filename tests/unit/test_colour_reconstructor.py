@@ -7,11 +7,12 @@ import pytest
 from scipy import ndimage
 
 from device.clock import Deadline, SystemClock, VirtualClock
+from device.recon.colour import RGB
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
 from device.recon.estimation.psf_warp import Wavefront
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor, RoundDone, StageResult, Step
-from device.recon.white_balance import OVER_GREEN, RGB
+from device.recon.white_balance import OVER_GREEN
 from device.values import ChannelUse, Colour, Image, Reconstruction
 from tests.moving_retina import RETINA, SHAPE, burst_calibration, field, frame, seen
 

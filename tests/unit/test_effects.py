@@ -10,11 +10,12 @@ from device.config.head_file import ChainSpec, InstrumentSpec, load_head
 from device.errors import SettingError, SpecError
 from device.optics.diffuser import Refraction
 from device.optics.led_cap import relative_intensity
+from device.optics.matrix import EMITTER_MM
 from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import Preprocessor
 from device.sim.effects import EFFECTS
 from device.sim.effects.eye import curvature_dpt, reflex_blobs, reflex_deg
-from device.sim.effects.illumination import EMITTER_MM, leds_mm, lit_share
+from device.sim.effects.illumination import leds_mm, lit_share
 from device.sim.effects.sensor import hot_pixels
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene, Size

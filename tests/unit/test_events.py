@@ -3,6 +3,7 @@
 import asyncio
 import json
 from collections.abc import Callable
+from contextlib import aclosing
 from threading import Thread
 
 import pytest
@@ -13,14 +14,13 @@ from services.instrument.events import BUFFER_LENGTH, Event, EventBus
 
 async def read(event_bus: EventBus, count: int, after: int | None = None, begin: Callable[[], None] = lambda: None):
     received: list[Event] = []
-    subscription = event_bus.subscribe(after)
-    async for event in subscription:
-        if not received:
-            begin()
-        received.append(event)
-        if len(received) == count:
-            break
-    await subscription.aclose()
+    async with aclosing(event_bus.subscribe(after)) as subscription:
+        async for event in subscription:
+            if not received:
+                begin()
+            received.append(event)
+            if len(received) == count:
+                break
     return received
 
 

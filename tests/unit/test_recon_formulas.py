@@ -8,7 +8,7 @@ import pytest
 from device.recon.assessment import image_quality
 from device.recon.assessment.psf_consistency import sparsity
 from device.recon.estimation.parameter_selection import MU_CANDIDATES, FrequencySample, cross_validated
-from device.recon.estimation.power_law_prior import PowerLaw, PowerLawPrior
+from device.recon.estimation.power_law_prior import BINS, PowerLaw, PowerLawPrior
 from device.recon.estimation.psf_selection import negative_log_likelihood
 from device.recon.methods import METHODS
 from device.recon.model.forward_model import Model, periodic_model
@@ -116,10 +116,10 @@ def test_the_cutoff_is_the_frequency_of_equal_signal_and_noise(model: Model) -> 
     """NUMERICS.md 8.1: the first ring whose mean of |H|^2 g / s2 is below 1, and its half-period on the retina."""
     prior, law, s2 = PowerLawPrior(model), PowerLaw(3.0, 2.0), 0.02
     snr = prior.power * np.exp(law.log_power - law.slope * prior.logs) / s2
-    below = [b for b in range(image_quality.BINS) if snr[prior.bins == b].mean() < 1]
-    edges = np.geomspace(prior.low, prior.high, image_quality.BINS + 1)
+    below = [b for b in range(BINS) if snr[prior.bins == b].mean() < 1]
+    edges = np.geomspace(prior.low, prior.high, BINS + 1)
     limit = image_quality.cutoff(prior, law, s2, 2, scenes.GEOMETRY)
-    assert 0 < below[0] < image_quality.BINS
+    assert 0 < below[0] < BINS
     assert limit.cycles_per_px == pytest.approx(edges[below[0]] / 2)
     assert limit.half_period_um == pytest.approx(0.5 / (limit.cycles_per_px * scenes.GEOMETRY.px_per_deg) * 296.7)
 

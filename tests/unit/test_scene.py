@@ -44,7 +44,7 @@ BAD = {  # text added to a scene, and the required words of the error
     "an unknown light": ('[sim.eye]\nshown_by = "torch"', ("sim.eye.shown_by", "'torch'", "'human eye'")),
     "a wild pixel": ("[sim.sensor]\nprnu = 3", ("sim.sensor.prnu", "3", "at least 0", "at most 0.2")),
 }
-WRONG = {
+WRONG: dict[str, dict[str, tuple[str, ...]]] = {
     "field_deg = 33.4": {
         "field_deg = 120": ("optics.field_deg", "120", "above 0", "at most 90"),
         "wavelength_um = 10.6": ("optics.wavelength_um", "10.6", "above 0.3", "below 1.2"),

@@ -1,5 +1,6 @@
 """Tests of signed calibration exports: only files of trusted signers, unchanged, are accepted."""
 
+import hashlib
 import io
 import random
 import shutil
@@ -160,9 +161,9 @@ def zipped(files: Mapping[str, bytes], **options: int) -> bytes:
 
 def resealed(files: Files, name: str, content: bytes) -> Files:
     """Return the files with one array replaced, and a manifest with its digest."""
-    digest = archive_module.hashlib.sha256(content).hexdigest()
+    digest = hashlib.sha256(content).hexdigest()
     manifest = archive_module.unsealed(files["manifest.toml"])
-    old = archive_module.hashlib.sha256(files[name]).hexdigest()
+    old = hashlib.sha256(files[name]).hexdigest()
     return files | {name: content, "manifest.toml": archive_module.sealed(manifest.replace(old, digest))}
 
 

@@ -17,8 +17,9 @@ from device.errors import CalibrationDamaged, CalibrationRefused, SpecError
 from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics.retina_chart import PAPER_REFLECTANCE
+from device.recon.colour import RGB
 from device.recon.colour_reconstructor import ColourReconstruction
-from device.recon.white_balance import OVER_GREEN, RGB, balanced, light_dn_per_s, white_ratios
+from device.recon.white_balance import OVER_GREEN, balanced, light_dn_per_s, white_ratios
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Colour, Frame, Illumination, Psf, Sensor, WhiteReference
 from services.instrument.capture_pipeline import plan_pipeline
