@@ -92,8 +92,15 @@ gate: $(GATE_ROOT)/ready ## Check schematic (ERC) and boards (DRC) of gate and r
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py
-# What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below nine minutes.
+# What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below six minutes.
 FAULTS := tests/hard tests/physics tests/property
+# Whole calibrations, every fault of every part, interruptions, restored backups, montages and every scene.
+INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibration_session.py test_calibration_monitor.py test_calibration_faults.py \
+	test_calibrate_command.py test_calibrations_command.py test_interrupted_press.py \
+	test_accuracy_explorer.py test_backup_page.py test_shutdown.py test_upload.py \
+	test_store_refusal_after_light.py test_visit_montage.py test_visit_export.py) \
+	$(addprefix tests/unit/,test_calibration_sequence.py test_calibration_measurements.py test_head_check.py test_trial_lenses.py \
+	test_damaged_rows.py test_montage.py test_backup.py test_effects.py test_scene_files.py)
 NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
 # Workers take file after file in the order given: what takes long comes first, so that no worker begins it when the
 # others end. pytest drops a file that is named beside its folder, so that each is named once.
@@ -102,16 +109,16 @@ IN_ORDER := --dist loadfile --no-loadscope-reorder
 WORKERS := -n 3 $(IN_ORDER)
 # A test of the page waits for the page's debounce, for fades and for the browser's start.
 PAGE_WORKERS := -n 4 $(IN_ORDER)
-LONG_FAULTS := $(addprefix tests/,hard/test_press_and_command.py property/test_simulated_mark.py)
+LONG_FAULTS := $(addprefix tests/,hard/test_press_and_command.py property/test_simulated_mark.py) $(INSTRUMENT_FAULTS)
 LONG_PAGES := $(addprefix tests/browser/,test_calibration_wizard.py test_software_update.py test_visit.py test_viewer.py test_page_states.py)
 LONG_GOLDEN := $(addprefix tests/golden/,test_golden_http.py test_golden_files.py test_golden_cli.py test_golden_exam.py)
 tests_of = $(wildcard $(addsuffix /test_*.py,$(1)))
 
 test: .venv/kernels browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
-	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests/journey $(call tests_of,tests) tests/unit
+	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) $(filter-out $(INSTRUMENT_FAULTS),$(call tests_of,tests/journey tests tests/unit))
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
-test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
+test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, faults of every part, optics and invariants.
 	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(LONG_FAULTS) $(filter-out $(LONG_FAULTS),$(call tests_of,$(FAULTS)))
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
