@@ -58,7 +58,6 @@ class ExamService:
         self.head = head
         self.store = store
         self.ready = Event()
-        self._watchdog = watchdog
         self._requests = requests = ExamRequests(clock)
         self.progress = Progress(clock, (FRAMES + 1) * head.spec.camera.exposure_s, budget_s)
         self.capture_journal = CaptureJournal(store)
@@ -133,11 +132,6 @@ class ExamService:
         return self.snapshot.output.quick_looks.get(id)
 
     def close(self) -> None:
-        """Send STOPPING to systemd and release the head."""
-        self._watchdog.stopping()
-        self.release_head()
-
-    def release_head(self) -> None:
         """Store the captures that are exposed, then close the head with the lamp off, for use by another owner.
 
         Wait for them at most SHUTDOWN_TIMEOUT_S. A press that is not exposed yet fails with Busy.

@@ -166,7 +166,7 @@ class HeadTransfer:
         problem = now.absence
         event_bus.publish("state", state=now.state)
         event_bus.publish("failed", code=problem.code, message=problem.message, remedy=problem.remedy)
-        exam.release_head()
+        exam.close()
 
     def _end_session(self, outcome: RunOutcome) -> None:
         """Reopen the exam after a calibration run, which stays the owner until then. Called from the thread of the run.
@@ -359,7 +359,7 @@ class HeadArbiter:
         self._transfer.close()
         self.stop_calibration()
         if (exam := self.owner.exam) is not None:
-            exam.release_head()
+            exam.close()
             self._transfer.record_failure(exam.failure)
 
 

@@ -1,7 +1,6 @@
 """Calibration run over HTTP in virtual time: complete, with injected faults, stopped, rolled back; trial lenses."""
 
 import asyncio
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -29,7 +28,7 @@ from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
-from tests.journey.conftest import SMALL_HEAD
+from tests.journey.conftest import SMALL_HEAD, until
 from tests.simulated import world
 from tests.unit.test_trial_lenses import WHO
 
@@ -42,14 +41,6 @@ TINY = (
 )
 CHIPS = '\n[bus]\nbackend = "sim"\nthermometer = 0x48\nmemory = 0x50\n'
 STANDS = ("cap", "screen", "point")
-
-
-def until(holds: Callable[[], bool], patience_s: float = 60.0) -> None:
-    """Wait for the thread that owns the head; each check is a request."""
-    end = time.monotonic() + patience_s
-    while not holds():
-        assert time.monotonic() < end, "timeout"
-        time.sleep(0.05)
 
 
 @dataclass

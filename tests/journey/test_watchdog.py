@@ -78,7 +78,7 @@ def test_ready_follows_planning_and_stopping_precedes_the_end(make_rig: Any, not
     rig = make_rig(watchdog=notify_socket.address)
     received = notify_socket.take_until("STATUS=aim")
     assert received[:3] == ["STATUS=making plans", "READY=1", "STATUS=aim"]  # and perhaps the first heartbeat
-    rig.exam.close()
+    rig.arbiter.close()
     notify_socket.take_until("STOPPING=1")
 
 
