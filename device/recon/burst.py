@@ -33,7 +33,7 @@ from device.recon.reconstructor import (
     default_schedule,
     plane,
 )
-from device.values import Calibration, FrameUse, Image
+from device.values import Calibration, FrameUse, Image, Mask
 
 SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading
 MIN_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
@@ -58,13 +58,13 @@ class JoinedFrame:
 class SeenFrame:
     """A frame that is ready to be joined: `BurstJoiner.see` makes it, before the other frames are known.
 
-    `light`: image of the light in DN above dark (in JoinedFrame a ratio), and `good`: 1 for good pixels, both (rows,
-    cols) of the sensor; `picture` on the grid of the registration; `mean_dn`: mean light in DN; `saturated`: share of
-    saturated pixels.
+    `light`: image of the light in DN above dark (in JoinedFrame a ratio), and `good`: mask of the good pixels, both
+    (rows, cols) of the sensor; `picture` on the grid of the registration; `mean_dn`: mean light in DN; `saturated`:
+    share of saturated pixels.
     """
 
     light: Image
-    good: Image
+    good: Mask
     picture: Image
     mean_dn: float
     saturated: float | None
@@ -77,8 +77,8 @@ class BurstJoiner:
     they have at least MIN_COARSE samples and the field is calibrated: in half the time, with 0.12 instead of 0.09
     pixels rms (NUMERICS.md 9.1).
 
-    It holds 8 bytes per pixel of each frame, and some arrays of one frame while it joins: 4 frames of 2.07 MP take 160
-    MB at the most, 16 frames 370 MB (measured). Not thread-safe.
+    It holds 5 bytes per pixel of each frame, and some arrays of one frame while it joins: 4 frames of 2.07 MP take 115
+    MB at the most, 16 frames 260 MB (measured). Not thread-safe.
     """
 
     def __init__(
@@ -156,10 +156,10 @@ class BurstJoiner:
         saturated = report.quality["saturated"]
         if NO_SIGNAL in report.warnings:
             raise FrameError("the frame holds no signal above the black level")
-        # A preprocessor of its own: its buffers are the result, and those of all frames are needed at once.
+        # A preprocessor of its own: its light is the result, and that of all frames is needed at once.
         full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
         linear = full(counts, dark, self._single.defects(counts, dark))
-        return SeenFrame(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn, saturated)
+        return SeenFrame(linear.y, linear.good > 0, self._stage.picture.copy(), linear.mean_dn, saturated)
 
     def _field(self, pictures: Sequence[Image]) -> Image:
         """Return the lit field on the grid of the pictures, 0 to 1; found in their mean if it is not calibrated."""
@@ -167,15 +167,15 @@ class BurstJoiner:
             return self._stage.model.mask
         return lit_field(np.mean(pictures, axis=0, dtype=np.float32), self._stage.grid)
 
-    def _smooth(self, seen: SeenFrame, field: Image, near: Image) -> tuple[Image, float]:
+    def _smooth(self, seen: SeenFrame, good: Image, field: Image, near: Image) -> tuple[Image, float]:
         """Return the smooth part of a frame on the sensor, its picture without detail, blurred by the PSF, and its
-        scale in DN; `near` is the blurred field.
+        scale in DN; `good` is 1 for its good pixels, `near` is the blurred field.
         """
         stage = self._stage
         sigma = SMOOTH_PX / self._stage.grid.n
         picture = ndimage.gaussian_filter(seen.picture * field, sigma) / near * field
         blurred = to_sensor(stage.model.blur(picture.astype(np.float32)), self._whole)
-        along, _, energy, _, _ = kernels.flat_fit_sums(seen.light, blurred, seen.good)  # least squares
+        along, _, energy, _, _ = kernels.flat_fit_sums(seen.light, blurred, good)  # least squares
         return blurred, along / energy if energy > 0 else 0.0
 
     def _join(self, seen: dict[int, SeenFrame], field: Image, uses: Sequence[FrameUse]) -> JoinedFrame:
@@ -184,7 +184,8 @@ class BurstJoiner:
         shares = {k: seen[k].mean_dn / total_dn for k in used}
         reference = seen[used[0]]
         near = np.maximum(ndimage.gaussian_filter(field, SMOOTH_PX / self._stage.grid.n), 0.05)
-        base, base_scale = self._smooth(reference, field, near)
+        good = reference.good.astype(np.float32)
+        base, base_scale = self._smooth(reference, good, field, near)
         detail = np.empty(self._shape, np.float32)
         joined = np.zeros(self._shape, np.float32)
         weights = np.zeros(self._shape, np.float32)
@@ -192,9 +193,10 @@ class BurstJoiner:
             shift = uses[k].shift_px
             frame = seen[k]
             assert shift is not None
-            smooth, scale = (base, base_scale) if frame is reference else self._smooth(frame, field, near)
-            kernels.subtract_scaled(frame.light, smooth, scale, frame.good, detail)
-            add_moved_back(detail, frame.good, shift, shares[k], reference.mean_dn / frame.mean_dn, joined, weights)
+            good[:] = frame.good
+            smooth, scale = (base, base_scale) if frame is reference else self._smooth(frame, good, field, near)
+            kernels.subtract_scaled(frame.light, smooth, scale, good, detail)
+            add_moved_back(detail, good, shift, shares[k], reference.mean_dn / frame.mean_dn, joined, weights)
         kernels.finish_mean(joined, weights, MIN_WEIGHT, base, base_scale)
         light = total_dn / reference.mean_dn
         frames = tuple(replace(use, weight=shares.get(use.index, 0.0)) for use in uses)

@@ -29,7 +29,7 @@ class FramePreparation:
     uses: the thread of the preparation does. Only frames in the light of the burst, `colour`, are prepared. `begin_s`:
     begin of the press (clock seconds). `looked` is called once, with the quick look of the first useful frame.
 
-    A prepared frame holds 8 bytes per pixel: 8 frames of 2 MP, the most of a press, take 135 MB.
+    A prepared frame holds 5 bytes per pixel: 8 frames of 2 MP, the most of a press, take 83 MB.
     """
 
     def __init__(

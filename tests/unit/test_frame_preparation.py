@@ -41,7 +41,7 @@ class Bench:
         self.refracted += [number] * refract
         picture = np.full((2, 2), number, np.float32)
         look = StageResult(Recipe(), picture, last=False)
-        return PreparedFrame(look, SeenFrame(picture, picture, picture, 1.0, 0.0))
+        return PreparedFrame(look, SeenFrame(picture, picture > 0, picture, 1.0, 0.0))
 
     def look(self, image: Image, simulated: bool) -> None:
         self.looks.append((int(image[0, 0]), simulated, current_thread().name))

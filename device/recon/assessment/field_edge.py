@@ -8,7 +8,7 @@ derivative of the field with respect to its radius.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,8 @@ class FieldEdge:
 class FieldEdgeFit:
     """Fit of displacement and radius of the field for one model with a known field, with the model's present OTF.
 
-    `low` and `high` limit the frequencies of the correlation, in cycles per sample; `taper` is the window function.
+    `low` and `high` limit the frequencies of the correlation, in cycles per sample; `taper` is the window function. The
+    modes are computed for each fit: their spectra would take 18 MB for a fit now and then.
     """
 
     def __init__(self, model: Model, low: float, high: float, taper: Image) -> None:
@@ -47,9 +48,7 @@ class FieldEdgeFit:
             (np.arange(size) - middle) / model.grid.radius_samples
             for size, middle in zip(model.grid.shape, model.grid.centre, strict=True)
         )
-        outward = edge[0] * down[:, None] + edge[1] * right[None]
-        all_modes = (*modes(model), outward.astype(np.float32))
-        self._spectra: list[Spectrum] = [scipy_fft.rfft2(np.asarray(mode)).astype(np.complex64) for mode in all_modes]
+        self._outward: Image = (edge[0] * down[:, None] + edge[1] * right[None]).astype(np.float32)
         self._rows = np.fft.fftfreq(model.grid.shape[0])[:, None]
         self._cols = np.fft.rfftfreq(model.grid.shape[1])
         frequency = np.hypot(self._rows, self._cols)
@@ -58,8 +57,8 @@ class FieldEdgeFit:
     def fit(self, y: Image, between: Callable[[], None]) -> FieldEdge:
         """Return displacement and radius of the field in the window `y` (DN); `between` is called before every mode."""
         off = self._displacement(y)
-        turn = np.exp(-2j * np.pi * (self._rows * off[0] + self._cols * off[1])) * self._model.otf
-        seen = [self._seen(spectrum * turn, between) for spectrum in self._spectra]
+        turn = np.exp(-2j * np.pi * (self._rows * off[0] + self._cols * off[1])).astype(np.complex64) * self._model.otf
+        seen = [self._seen(mode, turn, between) for mode in chain(modes(self._model), (self._outward,))]
         seen.append(np.full_like(seen[0], seen[0].max()))  # stray light
         design = np.stack(seen)
         weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + MIN_WEIGHT)
@@ -69,17 +68,17 @@ class FieldEdgeFit:
         outward = float(found[-2]) / max(float(found[0]), 1e-30)
         return FieldEdge(off, (outward + NARROW) / self._model.grid.radius_samples)
 
-    def _seen(self, spectrum: NDArray[np.complexfloating[Any, Any]], between: Callable[[], None]) -> Floats:
+    def _seen(self, mode: Image, turn: Spectrum, between: Callable[[], None]) -> Floats:
         between()
-        image = scipy_fft.irfft2(spectrum, self._model.grid.shape)
-        return blocks(image[self._model.grid.slices].astype(np.float32), BLOCK).ravel().astype(np.float64)
+        image: Image = scipy_fft.irfft2(scipy_fft.rfft2(mode) * turn, self._model.grid.shape)
+        return blocks(image[self._model.grid.slices], BLOCK).ravel().astype(np.float64)
 
     def _displacement(self, y: Image) -> tuple[float, float]:
         """Return the displacement (down, right) in samples: the correlation peak, refined by a parabola."""
         grid = self._model.grid
         space = np.zeros(grid.shape, np.float32)
         space[grid.slices] = y * self._taper
-        product = scipy_fft.rfft2(space) * np.conj(self._spectra[0] * self._model.otf)
+        product = scipy_fft.rfft2(space) * np.conj(scipy_fft.rfft2(self._model.mask) * self._model.otf)
         product[self._beyond] = 0
         match: Floats = scipy_fft.irfft2(product, grid.shape).astype(np.float64)
         at = np.unravel_index(int(np.argmax(match)), match.shape)

@@ -145,13 +145,12 @@ class DefectFinder:
         self._least_noise = (
             PixelNoise(0.0, 0.0) if gain is None else PixelNoise(1 / gain, (read_e / gain) ** 2 + QUANTISATION_DN2)
         )
-        self._bad: Mask = np.zeros(shape, np.bool_)
+        self._known: Mask = np.zeros(shape, np.bool_)
         if calibration.bad is not None and calibration.bad.shape == shape:
-            self._bad = calibration.bad
+            self._known[:] = calibration.bad
         self._ranges = ring_ranges(calibration.psfs[index])
         self._steepest = steepest(calibration.psfs[index])
         self._calibration, self._shape, self._index = calibration, shape, index
-        self._known: Mask = self._bad.copy()
         self._suspect: Mask = np.zeros(shape, np.bool_)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Places | None:
@@ -240,11 +239,12 @@ class DefectFinder:
         floor_dn2 = limit * noise.floor_dn2
         is_outlier = np.zeros(places.size, np.bool_)
         known = self._known.ravel()
+        before = known[places]
         for _ in range(PASSES):
             if not kernels.outliers(counts, offset, self._known, places, slope_dn, floor_dn2, self._ranges, is_outlier):
                 break
             known[places[is_outlier]] = True
-        known[places] = self._bad.ravel()[places]
+        known[places] = before
         return places[is_outlier] if np.count_nonzero(is_outlier) <= MAX_OUTLIERS * counts.size else places[:0]
 
     def _gaps(self, light: Image, dark_dn: float) -> Mask:

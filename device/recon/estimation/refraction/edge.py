@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.estimation.noise import Noise
-from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.psf_warp import InterpolatedOtf, transform
 from device.recon.estimation.refraction.field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
 from device.recon.estimation.refraction.likelihood import (
     Band,
@@ -91,7 +91,8 @@ class EdgeLikelihood:
         assert calibration.field_deg is not None
         self._count = 0 if edge_is_known else PARAMETERS
         wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
-        self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, SAMPLE_UM)
+        otf = InterpolatedOtf(calibration.psfs[index])
+        self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, otf, SAMPLE_UM)
         self.grid = self.likelihood.grid
         self.band: Band = self.likelihood.bands.whole
         self.prior = EdgePrior(calibration.field_deg, geometry.px_per_deg / self.grid.n)

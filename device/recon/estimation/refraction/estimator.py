@@ -180,7 +180,8 @@ class RefractionEstimator:
     @cached_property
     def likelihood(self) -> RefractionLikelihood:
         """Likelihood within the calibrated field edge, for tests of the head."""
-        return RefractionLikelihood(self._calibration, self.geometry, self._shape, self._planner, self._index)
+        otf = self._edges.likelihood.interpolated_otf
+        return RefractionLikelihood(self._calibration, self.geometry, self._shape, self._planner, self._index, otf)
 
     def find(
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None

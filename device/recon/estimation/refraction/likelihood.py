@@ -161,7 +161,10 @@ def band_likelihood(rest: Spectrum, otf: Spectrum, band: Band, noise_dn2: float)
 
 
 class RefractionLikelihood:
-    """Negative log likelihood of a mean sphere M for PSF `index` of one calibration, and one sensor shape."""
+    """Negative log likelihood of a mean sphere M for PSF `index` of one calibration, and one sensor shape.
+
+    `interpolated_otf` is that of the PSF; likelihoods with other fields of view share it, as it holds up to 32 MB.
+    """
 
     def __init__(
         self,
@@ -170,11 +173,12 @@ class RefractionLikelihood:
         shape: Pair,
         planner: Planner,
         index: int,
+        interpolated_otf: InterpolatedOtf,
         sample_um: float = SAMPLE_UM,
     ) -> None:
         self.geometry = geometry
         self.sensor = calibration.sensor
-        self.interpolated_otf = InterpolatedOtf(calibration.psfs[index])
+        self.interpolated_otf = interpolated_otf
         n = max(1, min(round(sample_um / geometry.pitch_um), min(shape) // 16))
         self.model = tight_model(calibration, shape, n, planner, index)
         self._preparer = Preprocessor(calibration, self.grid)
