@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from math import nan, sqrt
 
 import numpy as np
+import scipy  # whose module optimize is imported at its first use: it takes 22 MB, and only a calibration needs it
 from numpy.typing import NDArray
-from scipy.optimize import brentq, least_squares
 from scipy.special import ndtr, ndtri
 
 from device.calibration.procedure.moments import Moments
@@ -112,7 +112,7 @@ def fit_normal(mean_dn: float, variance_dn2: float) -> tuple[float, float]:
     starts = [(np.floor(mean_dn) + lean * below + (1 - lean) * 0.5, 0.2) for lean in (1.0, 0.5, 0.2)]
     starts.append((mean_dn, sqrt(max(variance_dn2 - 1 / 12, 0.04))))
     box = ([mean_dn - 1, MIN_SIGMA_DN], [mean_dn + 1, 2 * sqrt(variance_dn2) + 1])
-    tried = [least_squares(miss, start, bounds=box, xtol=1e-12, ftol=1e-14) for start in starts]
+    tried = [scipy.optimize.least_squares(miss, start, bounds=box, xtol=1e-12, ftol=1e-14) for start in starts]
     found = min(tried, key=lambda fit: float(fit.cost))
     return float(found.x[0]), float(found.x[1])
 
@@ -134,7 +134,7 @@ def widest_normal(mean_dn: float, samples: int) -> tuple[float, float]:
         mean, variance = quantised_moments(*distribution(sigma_dn))
         return variance - (mean % 1) * (1 - mean % 1) - MIN_THIRD_COUNTS / samples
 
-    return distribution(float(brentq(beyond, MIN_SIGMA_DN / 2, 1.0, xtol=1e-4)))
+    return distribution(float(scipy.optimize.brentq(beyond, MIN_SIGMA_DN / 2, 1.0, xtol=1e-4)))
 
 
 def read_noise_dn(mean_dn: float, total_dn: float, temporal_dn2: float) -> float:
@@ -151,7 +151,9 @@ def read_noise_dn(mean_dn: float, total_dn: float, temporal_dn2: float) -> float
 
     if miss(total_dn) <= 0:  # the fixed spread cannot be separated from the noise
         return total_dn
-    return float(brentq(miss, MIN_SIGMA_DN / 2, total_dn, xtol=1e-6)) if miss(MIN_SIGMA_DN / 2) < 0 else MIN_SIGMA_DN
+    if miss(MIN_SIGMA_DN / 2) >= 0:
+        return MIN_SIGMA_DN
+    return float(scipy.optimize.brentq(miss, MIN_SIGMA_DN / 2, total_dn, xtol=1e-6))
 
 
 def _fit_level(exposure: Moments, hot: Mask) -> tuple[float, float]:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from math import hypot, sqrt
 
 import numpy as np
+import scipy  # whose module optimize is imported at its first use: 22 MB that only a calibration needs
 from numpy.typing import NDArray
-from scipy import fft, ndimage, optimize
+from scipy import fft, ndimage
 
 from device.calibration.procedure.point_source import PointSource
 from device.errors import CalibrationRefused
@@ -69,7 +70,7 @@ def fit_similarity(of: Psf, into: Psf, pitch_um: float) -> PsfSimilarity:
         stretched = _warped(splines, 1 + unknown[0] / edge, (unknown[1], unknown[2]))
         return np.ravel(stretched * (_dot(stretched, seen) / _dot(stretched, stretched)) - seen)
 
-    found = optimize.least_squares(miss, (edge * (start[0] - 1), *start[1:]), method="lm", diff_step=[1e-3] * 3).x
+    found = scipy.optimize.least_squares(miss, (edge * (start[0] - 1), *start[1:]), method="lm", diff_step=[1e-3] * 3).x
     scale = float(1 + found[0] / edge)
     best = _warped(splines, scale, (found[1], found[2]))
     likeness = float(np.corrcoef(best.ravel(), seen.ravel())[0, 1])
