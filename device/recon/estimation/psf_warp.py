@@ -26,6 +26,7 @@ Transform = NDArray[np.float64]
 PADDING = 6  # oversampling of the stored spectrum: the interpolation error at the PSF's edge is (1/11)^2 = 0.8 %
 REACH = 1.06  # a stretch by 9 dpt extends 3 % beyond the last frequency, cylinders a little more
 LARGEST = 4e6  # numbers in the table: 32 MB
+COLUMNS = 32  # of the table that are transformed at a time: all at once would take 90 MB for a moment
 
 
 class Wavefront(NamedTuple):
@@ -75,10 +76,15 @@ class InterpolatedOtf:
         last = self._last
         half = scipy_fft.rfft(pixels, self.pixels, axis=1)[:, : last + 1]
         half *= np.exp(2j * np.pi * middle[1] / self.pixels * np.arange(last + 1)).astype(np.complex64)
-        whole = scipy_fft.fft(half, self.pixels, axis=0)
-        table: Spectrum = np.concatenate([whole[-last:], whole[: last + 1]])
-        centred = np.exp(2j * np.pi * middle[0] / self.pixels * np.arange(-last, last + 1)) / whole[0, 0].real
-        table *= centred.astype(np.complex64)[:, None]
+        table: Spectrum = np.empty((2 * last + 1, last + 1), np.complex64)
+        total = float(half[:, 0].real.sum(dtype=np.float64))
+        centred = np.exp(2j * np.pi * middle[0] / self.pixels * np.arange(-last, last + 1)) / total
+        turn = centred.astype(np.complex64)[:, None]
+        for begin in range(0, last + 1, COLUMNS):
+            part = slice(begin, begin + COLUMNS)
+            whole = scipy_fft.fft(half[:, part], self.pixels, axis=0)
+            np.multiply(whole[-last:], turn[:last], out=table[:last, part])
+            np.multiply(whole[: last + 1], turn[last:], out=table[last:, part])
         return table
 
     def on_grid(self, shape: Pair, n: int, transform: Transform, out: Spectrum | None = None) -> Spectrum:
@@ -118,9 +124,10 @@ def picture_otf(interpolated: InterpolatedOtf, model: Model, transform: Transfor
 def _supported(psf: Psf) -> tuple[NDArray[np.float64], Pair]:
     """Return the part of a PSF inside its support radius, zero elsewhere, and the position of its centre."""
     radius_px = support_radius_px(psf)
-    rows, cols = (np.arange(size) - size // 2 for size in psf.shape)
-    lit = np.where(np.hypot(rows[:, None], cols[None]) < radius_px, psf.pixels.astype(np.float64), 0)
     low = [max(size // 2 - int(radius_px), 0) for size in psf.shape]
     high = [min(size // 2 + int(radius_px) + 1, size) for size in psf.shape]
-    part = np.ascontiguousarray(lit[low[0] : high[0], low[1] : high[1]])
-    return part, (psf.shape[0] // 2 - low[0], psf.shape[1] // 2 - low[1])
+    middle = psf.shape[0] // 2 - low[0], psf.shape[1] // 2 - low[1]
+    part = psf.pixels[low[0] : high[0], low[1] : high[1]].astype(np.float64)
+    rows, cols = (np.arange(size) - centre for size, centre in zip(part.shape, middle, strict=True))
+    part[np.hypot(rows[:, None], cols[None]) >= radius_px] = 0
+    return part, middle
