@@ -110,7 +110,7 @@ def shown(folder: Path, with_settings: bool = False) -> tuple[Shown, int]:
         queue.status()
         queue.queued(sizes=True)
         people.counts()
-        captures = {one.id: one for one in store.captures(1000)}
+        captures = {capture.id: capture for capture in store.captures(1000)}
         reported = store.damaged() + people.damaged() + len(store.quarantine.orphans()) + len(store.recovery.missing)
         files = {}
         for id, capture in captures.items():
@@ -119,7 +119,7 @@ def shown(folder: Path, with_settings: bool = False) -> tuple[Shown, int]:
                     files[id, name] = store.read(id, name)
                 except (StoreDamaged, RecordNotFound):
                     reported += 1
-        visits = {one.id: visit_document(one).model_dump_json() for one in people.visits(1000)}
+        visits = {visit.id: visit_document(visit).model_dump_json() for visit in people.visits(1000)}
         doses = {eye: light.spent_j_per_cm2(eye) for eye in ("OD", "OS")}
         settings = dict[str, str]()
         if with_settings:
@@ -133,7 +133,10 @@ def settings_of(folder: Path, journal: tuple[InterruptedCapture, ...]) -> tuple[
 
     A damaged entry of the journal is reported by its missing visit; nothing in it was acknowledged.
     """
-    found, reported = {one.id: repr(one) for one in journal if one.visit}, sum(one.visit is None for one in journal)
+    found, reported = (
+        {entry.id: repr(entry) for entry in journal if entry.visit},
+        sum(entry.visit is None for entry in journal),
+    )
     reads: dict[str, Callable[[], object]] = {
         "calibration": lambda: Archive(folder / "calibrations" / "head").load().calibration.id,
         "login": lambda: bool(PinAuthenticator(folder / "technician.json", VirtualClock()).log_in(PIN)),
@@ -188,7 +191,7 @@ Damage = Callable[[Path, list[Path], random.Random], str]
 
 
 def flip_bit(folder: Path, paths: list[Path], source: random.Random) -> str:
-    path = source.choice([one for one in paths if one.stat().st_size])
+    path = source.choice([file for file in paths if file.stat().st_size])
     content = bytearray(path.read_bytes())
     place, bit = source.randrange(len(content)), source.randrange(8)
     content[place] ^= 1 << bit
@@ -205,7 +208,7 @@ def truncate(folder: Path, paths: list[Path], source: random.Random) -> str:
 
 
 def zero_block(folder: Path, paths: list[Path], source: random.Random) -> str:
-    path = source.choice([one for one in paths if one.stat().st_size])
+    path = source.choice([file for file in paths if file.stat().st_size])
     content = bytearray(path.read_bytes())
     place = source.randrange(0, len(content), PIECE_BYTES)
     piece = content[place : place + PIECE_BYTES]
@@ -221,11 +224,11 @@ def remove(folder: Path, paths: list[Path], source: random.Random) -> str:
 
 
 def swap(folder: Path, paths: list[Path], source: random.Random) -> str:
-    one, other = source.sample(sorted(paths), 2)
-    first, second = one.read_bytes(), other.read_bytes()
-    one.write_bytes(second)
-    other.write_bytes(first)
-    return f"{one.relative_to(folder)} and {other.relative_to(folder)} swapped"
+    left, right = source.sample(sorted(paths), 2)
+    first, second = left.read_bytes(), right.read_bytes()
+    left.write_bytes(second)
+    right.write_bytes(first)
+    return f"{left.relative_to(folder)} and {right.relative_to(folder)} swapped"
 
 
 def lose_table(folder: Path, _: list[Path], source: random.Random) -> str:
@@ -353,9 +356,9 @@ def table(trials: list[Trial]) -> str:
         "| target | damage | trials | all shown unchanged | some reported as damaged | silent or failed |",
         "|---|---|---|---|---|---|",
     ]
-    for target, damage in sorted({(one.target, one.damage) for one in trials}):
-        some = [one for one in trials if (one.target, one.damage) == (target, damage)]
-        counts = [sum(one.outcome == outcome for one in some) for outcome in ("whole", "reported")]
-        violations = sum(bool(one.violations) for one in some)
+    for target, damage in sorted({(trial.target, trial.damage) for trial in trials}):
+        some = [trial for trial in trials if (trial.target, trial.damage) == (target, damage)]
+        counts = [sum(trial.outcome == outcome for trial in some) for outcome in ("whole", "reported")]
+        violations = sum(bool(trial.violations) for trial in some)
         lines.append(f"| {target} | {damage} | {len(some)} | {counts[0]} | {counts[1]} | {violations} |")
     return "\n".join(lines)

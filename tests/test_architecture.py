@@ -144,24 +144,28 @@ VALUES = {"NamedTuple", "TypedDict", "Enum", "StrEnum", "IntEnum", "BaseModel", 
 def is_value(node: ast.ClassDef) -> bool:
     """Return whether a class is a frozen value, a model or a table, which may have any number of fields."""
     decorators, bases = map(ast.unparse, node.decorator_list), {ast.unparse(base).split(".")[-1] for base in node.bases}
-    return any("dataclass" in one and "frozen=True" in one for one in decorators) or bool(bases & VALUES)
+    return any("dataclass" in call and "frozen=True" in call for call in decorators) or bool(bases & VALUES)
 
 
 def attributes(node: ast.ClassDef) -> set[str]:
     """Return the names that a class body or the methods of the class assign."""
-    names = {one.target.id for one in node.body if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)}
-    plain = [target for one in node.body if isinstance(one, ast.Assign) for target in one.targets]
+    names = {
+        statement.target.id
+        for statement in node.body
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name)
+    }
+    plain = [target for statement in node.body if isinstance(statement, ast.Assign) for target in statement.targets]
     names |= {target.id for target in plain if isinstance(target, ast.Name)}
-    for one in ast.walk(node):
-        if isinstance(one, ast.Attribute) and isinstance(one.ctx, ast.Store) and ast.unparse(one.value) == "self":
-            names.add(one.attr)
+    for part in ast.walk(node):
+        if isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store) and ast.unparse(part.value) == "self":
+            names.add(part.attr)
     return names
 
 
 def large_classes(source: str) -> Iterator[Violation]:
     for node in nodes(source):
         if isinstance(node, ast.ClassDef) and size_reason(source, node.lineno) is None:
-            methods = sum(isinstance(one, Function) for one in node.body)
+            methods = sum(isinstance(statement, Function) for statement in node.body)
             if methods > MAX_METHODS:
                 yield node.lineno, node.name, f"{methods} methods"
             elif len(attributes(node)) > MAX_ATTRIBUTES and not is_value(node):
@@ -312,14 +316,14 @@ def untyped_dicts(source: str) -> Iterator[Violation]:
     annotated: list[tuple[int, str, ast.expr | None]] = []
     for node in nodes(source):
         if isinstance(node, Function):
-            arguments = [one for one in ast.walk(node.args) if isinstance(one, ast.arg)]
-            annotated += [(one.lineno, node.name, one.annotation) for one in arguments]
+            arguments = [argument for argument in ast.walk(node.args) if isinstance(argument, ast.arg)]
+            annotated += [(argument.lineno, node.name, argument.annotation) for argument in arguments]
             annotated.append((node.lineno, node.name, node.returns))
         if isinstance(node, ast.ClassDef | ast.Module):
-            assigned = [one for one in node.body if isinstance(one, ast.Assign | ast.AnnAssign)]
-            annotated += [(one.lineno, "assignment", one.value) for one in assigned]
-            fields = [one for one in assigned if isinstance(one, ast.AnnAssign)]
-            annotated += [(one.lineno, ast.unparse(one.target), one.annotation) for one in fields]
+            assigned = [statement for statement in node.body if isinstance(statement, ast.Assign | ast.AnnAssign)]
+            annotated += [(statement.lineno, "assignment", statement.value) for statement in assigned]
+            fields = [field for field in assigned if isinstance(field, ast.AnnAssign)]
+            annotated += [(field.lineno, ast.unparse(field.target), field.annotation) for field in fields]
     for line, name, annotation in annotated:
         if annotation is not None and UNTYPED.search(ast.unparse(annotation)):
             yield line, name, "a mapping of names to values of any type"
@@ -382,7 +386,9 @@ def private_accesses(source: str) -> Iterator[Violation]:
                 yield node.lineno, node.attr, f"a private attribute of {owner}"
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "setattr", "vars"):
             words = [
-                one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)
+                constant.value
+                for constant in ast.walk(node)
+                if isinstance(constant, ast.Constant) and isinstance(constant.value, str)
             ]
             yield from ((node.lineno, word, "a private attribute") for word in words if re.match(r"_(?!_)", word))
 
@@ -461,9 +467,11 @@ def umask_writes(source: str) -> Iterator[Violation]:
         if isinstance(node, ast.Call):
             name = node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)
             texts = [
-                one.value for one in (*node.args, *(k.value for k in node.keywords)) if isinstance(one, ast.Constant)
+                argument.value
+                for argument in (*node.args, *(k.value for k in node.keywords))
+                if isinstance(argument, ast.Constant)
             ]
-            opens = name == "open" and any(isinstance(one, str) and one and one[0] in "wax" for one in texts)
+            opens = name == "open" and any(isinstance(value, str) and value and value[0] in "wax" for value in texts)
             is_private = any(keyword.arg == "opener" for keyword in node.keywords)
             if name in ("mkdir", "makedirs", "write_text", "write_bytes", "touch") or (opens and not is_private):
                 yield node.lineno, name, "use device/atomic_io.py, or its private_opener"

@@ -84,7 +84,9 @@ def missing_names(markdown: str) -> list[str]:
     missing = [name for name in modules if not is_name(name)]
     missing += [id for id in tests if not is_test(*id.split("::"))]
     return missing + [
-        name for name in sources if name not in vendored and not any(f"/{one}".endswith(f"/{name}") for one in places())
+        name
+        for name in sources
+        if name not in vendored and not any(f"/{place}".endswith(f"/{name}") for place in places())
     ]
 
 

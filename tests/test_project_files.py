@@ -121,12 +121,12 @@ def test_every_test_file_is_run_by_a_make_target_that_names_it_once() -> None:
     """pytest drops a file that is named beside a folder that holds it, and then leaves out what that folder ignores."""
     named = {target: pytest_arguments(target) for target in make_targets() if target.startswith("test")}
     twice = [
-        (target, one, other) for target, all in named.items() for one in all for other in all if f"{one}/" in other
+        (target, path, other) for target, all in named.items() for path in all for other in all if f"{path}/" in other
     ]
     assert not twice
-    run = [one for all in named.values() for one in all]
+    run = [path for all in named.values() for path in all]
     tests = [name for name in files() if re.fullmatch(r"tests/(.+/)?test_\w+\.py", name)]
-    assert not [name for name in tests if not any(name == one or name.startswith(f"{one}/") for one in run)]
+    assert not [name for name in tests if not any(name == path or name.startswith(f"{path}/") for path in run)]
 
 
 def test_make_clean_removes_all_that_git_ignores() -> None:
@@ -214,7 +214,7 @@ def commands() -> dict[str, set[str]]:
     """Return the commands of `diffuscope`, subcommands included, each with its options."""
     outer = dict(subcommands(typer.main.get_group(app)))
     outer |= {"paper": typer.main.get_command(paper), "hard": typer.main.get_command(hard)}
-    inner = [(f"{name} {second}", command) for name, one in outer.items() for second, command in subcommands(one)]
+    inner = [(f"{name} {second}", command) for name, parent in outer.items() for second, command in subcommands(parent)]
     return {
         name: {"--help"}.union(*(p.opts + p.secondary_opts for p in command.params))
         for name, command in [*outer.items(), *inner]
@@ -271,7 +271,7 @@ def test_paths_in_a_readme_exist(readme: str) -> None:
     missing = []
     for path in sorted(named_paths(text(readme))):
         at = [normpath(base / path.split("#")[0]) for base in (Path(), here)]
-        if not any(place in there or any(fnmatch(one, place) for one in there) for place in at):
+        if not any(place in there or any(fnmatch(entry, place) for entry in there) for place in at):
             missing.append(path)
     assert not missing, f"{readme} names what is not there"
 
@@ -281,7 +281,7 @@ def test_every_folder_has_a_readme() -> None:
     there = {str(parent) for name in files() for parent in Path(name).parents}
     inner = {str(Path(n).parent) for n in files() if re.fullmatch(r"(device|services)/\w+/__init__\.py", n)}
     folders = {folder for folder in TOP_FOLDERS if folder in there} | inner
-    assert not sorted(one for one in folders if f"{one}/README.md" not in files()), "folders without a README"
+    assert not sorted(folder for folder in folders if f"{folder}/README.md" not in files()), "folders without a README"
 
 
 MAX_README_LINES, MAX_DECISION_LINES = 60, 25
@@ -300,7 +300,7 @@ def test_a_decision_is_one_short_numbered_file(decision: str) -> None:
     assert text(decision).count("\n") <= MAX_DECISION_LINES
 
 
-@pytest.mark.parametrize("folder", [one for one in TOP_FOLDERS if f"{one}/README.md" in files()])
+@pytest.mark.parametrize("folder", [folder for folder in TOP_FOLDERS if f"{folder}/README.md" in files()])
 def test_a_map_names_every_folder(folder: str) -> None:
     """The README of a top folder names each of its folders."""
     there = {str(parent) for name in files() for parent in Path(name).parents}
@@ -344,9 +344,9 @@ def wrong_citations(source: str, citing: str) -> list[str]:
         documents = cited_documents(path, citing)
         known = [sections(text(name)) for name in documents]
         cited = re.findall(r"\d+\.\d+", numbers)
-        wrong += [f"{path} {number}" for number in cited if not any(number in one for one in known)]
+        wrong += [f"{path} {number}" for number in cited if not any(number in contents for contents in known)]
         for item in re.findall(r"\d+", items):
-            if not any(item in one.get(cited[-1], ()) for one in known):
+            if not any(item in contents.get(cited[-1], ()) for contents in known):
                 wrong.append(f"{path} {cited[-1]}, item {item}")
         if not documents and not path.endswith(tuple(NO_DOCUMENT)):
             wrong.append(path)
@@ -364,7 +364,7 @@ def test_a_wrong_citation_is_found() -> None:
         "hardware/assembly.md",
         "OPTICS.md 1.2, 30 degrees",
     )
-    assert [wrong_citations(one, here) for one in right] == [[]] * len(right)
+    assert [wrong_citations(citation, here) for citation in right] == [[]] * len(right)
     wrong = {
         "optics.md": ["optics.md"],
         "(OPTICS.md 1.1, 99.1 and 1.4)": ["OPTICS.md 99.1"],
@@ -374,7 +374,7 @@ def test_a_wrong_citation_is_found() -> None:
         "](../OPTICS.md) 1.1": ["../OPTICS.md 1.1", "../OPTICS.md"],
         "notes/optics.md": ["notes/optics.md"],
     }
-    assert {one: wrong_citations(one, here) for one in wrong} == wrong
+    assert {citation: wrong_citations(citation, here) for citation in wrong} == wrong
 
 
 def test_every_citation_of_a_document_resolves() -> None:
@@ -390,10 +390,10 @@ def test_every_citation_of_a_document_resolves() -> None:
 def test_sections_of_a_document_are_numbered_in_order(document: str) -> None:
     """Sections are appended and never renumbered, so the numbers of a chapter have no gap."""
     numbers = [tuple(map(int, number.split("."))) for number in sections(text(document))]
-    chapters = [one for one in numbers if len(one) == 1]
+    chapters = [number for number in numbers if len(number) == 1]
     inner = [(c[0], k) for c in chapters for k in range(1, 1 + sum(n[0] == c[0] and len(n) == 2 for n in numbers))]
     assert chapters == [(k,) for k in range(1, len(chapters) + 1)]
-    assert [one for one in numbers if len(one) == 2] == inner
+    assert [number for number in numbers if len(number) == 2] == inner
 
 
 # Paths in other files
@@ -418,7 +418,7 @@ def missing_paths(name: str) -> list[str]:
     there = known_paths()
     paths = {found.rstrip("./") for found in PATH.findall(text(name)) if not found.startswith("web/vendor/")}
     modules = {found.rstrip(".").replace(".", "/") for found in MODULE.findall(text(name))}
-    missing = [path for path in paths if path not in there and not any(fnmatch(one, path) for one in there)]
+    missing = [path for path in paths if path not in there and not any(fnmatch(entry, path) for entry in there)]
     return missing + [module for module in modules if not {module, f"{module}.py"} & there]
 
 

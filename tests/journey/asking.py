@@ -126,7 +126,7 @@ def next_preview(rig: Rig, after: int, eye: str = "OD") -> int:
 def active_alert(rig: Rig, code: str) -> Observation:
     """Return the active alert `code` of the status; assert that the event bus published the same alert."""
     before = rig.event_bus.last_number
-    alerts = {one.pop("code"): one for one in rig.request("GET", "/api/status").json()["standing"]}
+    alerts = {alert.pop("code"): alert for alert in rig.request("GET", "/api/status").json()["standing"]}
     rig.application.alerts.publish_changes()
     since = [event for event in rig.event_bus.history if event.number > before]
     news = [event.data for event in since if event.kind == "notice" and event.data["code"] == code]

@@ -277,9 +277,9 @@ def fail_upload(rig: Rig, disk: DiskStub, answers: dict[str, int]) -> dict[str, 
     listed = rig.request("GET", "/api/upload-queue").json()
     assert (listed["configured"], listed["waiting"]) == (True, len(listed["visits"]))
     assert rig.request("GET", "/api/status").json()["sending"]["waiting"] == listed["waiting"]
-    one: dict[str, Any] = next(one for one in listed["visits"] if one["visit"] == visit)
-    assert one["size_bytes"] > 1000
-    return one
+    entry: dict[str, Any] = next(queued for queued in listed["visits"] if queued["visit"] == visit)
+    assert entry["size_bytes"] > 1000
+    return entry
 
 
 def upload_worker(rig: Rig) -> UploadWorker:
@@ -300,14 +300,14 @@ def upload_pending(rig: Rig) -> None:
 def assert_resolved(rig: Rig, code: str) -> None:
     """Assert that the alert is inactive and that its end was published."""
     rig.application.alerts.publish_changes()
-    assert code not in {one["code"] for one in rig.request("GET", "/api/status").json()["standing"]}
+    assert code not in {alert["code"] for alert in rig.request("GET", "/api/status").json()["standing"]}
     assert [data for _, data in rig.published_events() if data.get("code") == code][-1] == {"code": code, "over": True}
 
 
 def upload_waiting(rig: Rig, disk: DiskStub) -> Observation:
-    one = fail_upload(rig, disk, {"HEAD": 503})
-    assert (one["tries"], one["stuck"], one["error"]["code"]) == (1, False, "send.link")
-    assert "503" in one["error"]["message"]
+    entry = fail_upload(rig, disk, {"HEAD": 503})
+    assert (entry["tries"], entry["stuck"], entry["error"]["code"]) == (1, False, "send.link")
+    assert "503" in entry["error"]["message"]
     observed = active_alert(rig, "send.waiting")
     assert post_capture(rig).way == "verdict", "captures do not wait for the network"
     disk.receiver.answers = {}
@@ -319,9 +319,9 @@ def upload_waiting(rig: Rig, disk: DiskStub) -> Observation:
 
 def upload_stuck(rig: Rig, disk: DiskStub) -> Observation:
     before = len(disk.receiver.kept)
-    one = fail_upload(rig, disk, {"PUT": 403})
-    assert (one["stuck"], one["error"]["code"]) == (True, "send.key")
-    assert len(one["error"]["remedy"]) > 20
+    entry = fail_upload(rig, disk, {"PUT": 403})
+    assert (entry["stuck"], entry["error"]["code"]) == (True, "send.key")
+    assert len(entry["error"]["remedy"]) > 20
     observed = active_alert(rig, "send.stuck")
     assert post_capture(rig).way == "verdict"
     disk.receiver.answers = {}
@@ -402,6 +402,6 @@ def repair(rig: Rig) -> None:
     wait_until_idle(rig)
     until(lambda: not rig.exam.calibration_monitor.has_pending, 120)
     rig.exam.calibration_monitor.forget_results()  # results of this scenario must not affect the next one
-    for one in rig.request("GET", "/api/status").json()["standing"]:
-        if one["code"] == "eye.side":  # an open question would affect the next scenario
-            rig.request("POST", f"/api/captures/{one['id']}/eye", json={"key": secrets.token_hex(8), "eye": "OD"})
+    for alert in rig.request("GET", "/api/status").json()["standing"]:
+        if alert["code"] == "eye.side":  # an open question would affect the next scenario
+            rig.request("POST", f"/api/captures/{alert['id']}/eye", json={"key": secrets.token_hex(8), "eye": "OD"})

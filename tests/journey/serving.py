@@ -22,19 +22,19 @@ def served(app: Any, limits: ConnectionLimits, *ports: dict[str, Any]) -> Iterat
     servers = [Server(config, EventBus()) for config in configs]
     with ExitStack() as undo:
         sockets = [undo.enter_context(bind_socket("127.0.0.1", 0)) for _ in servers]
-        numbers = tuple(int(one.getsockname()[1]) for one in sockets)
+        numbers = tuple(int(listener.getsockname()[1]) for listener in sockets)
 
         async def run() -> None:
-            await asyncio.gather(*(one.serve([own]) for one, own in zip(servers, sockets, strict=True)))
+            await asyncio.gather(*(server.serve([own]) for server, own in zip(servers, sockets, strict=True)))
 
         thread = Thread(target=lambda: asyncio.run(run()), name="served")
         thread.start()
         try:
-            until(lambda: all(one.started for one in servers))
+            until(lambda: all(server.started for server in servers))
             yield numbers
         finally:
-            for one in servers:
-                one.should_exit = True
+            for server in servers:
+                server.should_exit = True
             thread.join(30)
 
 

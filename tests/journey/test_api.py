@@ -482,12 +482,12 @@ def test_event_stream_ends_when_the_event_bus_closes(rig: Any, read_events: Any)
 
 def test_versions_of_a_capture_are_listed_with_working_links(old_rig: Any) -> None:
     kept = old_rig.exam.press("OD").result(30)
-    at, frames = f"/api/captures/{kept.id}", {name: one for name, one in kept.files.items() if name.endswith(".tiff")}
+    at, frames = f"/api/captures/{kept.id}", {name: file for name, file in kept.files.items() if name.endswith(".tiff")}
     taken = old_rig.request("GET", at).json()
     assert "versions" not in taken
     new = NewVersion(kept.id, "a" * 32, frames, "", "variation", "1.2", b"new", b'{"method": "variation"}')
-    for one in (new, replace(new, result="b" * 32, colour=b"new in colour")):
-        old_rig.store.versions.adopt(one, old_rig.clock.wall())
+    for version in (new, replace(new, result="b" * 32, colour=b"new in colour")):
+        old_rig.store.versions.adopt(version, old_rig.clock.wall())
     capture = old_rig.request("GET", at).json()
     assert capture["links"] == taken["links"]
     first, second = capture["versions"]

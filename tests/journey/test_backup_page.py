@@ -67,7 +67,7 @@ def test_a_backup_beside_the_exam_restores_its_captures(ask: Ask, rig: Rig, stic
     secret = key_of_passphrase(read_header(folder), PASSPHRASE)
     restore_backup(folder, secret, tmp_path / "new", lambda done, total: None)
     with CaptureStore(tmp_path / "new", reserve_bytes=0) as store:
-        assert [one.id for one in store.captures()] == [first]
+        assert [capture.id for capture in store.captures()] == [first]
         for name in store.get(first).files:
             assert store.read(first, name) == rig.store.read(first, name)
 
@@ -76,7 +76,7 @@ def test_a_backup_is_due_a_week_after_the_first_picture_that_is_in_none(ask: Ask
     post_capture(rig)
     rig.clock.elapsed_s += 7 * DAY_S + 60
     assert ask("GET").json()["is_due"]
-    health = {one["name"]: one for one in rig.request("GET", "/api/health").json()["checks"]}
+    health = {check["name"]: check for check in rig.request("GET", "/api/health").json()["checks"]}
     assert (health["backup"]["ok"], health["backup"]["value"]) == (False, "none yet")
     ask("POST", "/passphrase", json={"passphrase": PASSPHRASE})
     ask("POST", json={"folder": drive_id(stick)})

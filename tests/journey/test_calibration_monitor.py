@@ -52,7 +52,7 @@ def _rotate_centre(pixels: np.ndarray) -> np.ndarray:
 
 def health(rig: Any) -> dict[str, Any]:
     answer = rig.request("GET", "/api/health").json()
-    return {one["name"]: one for one in answer["calibration"]} | {"ok": answer["ok"]}
+    return {check["name"]: check for check in answer["calibration"]} | {"ok": answer["ok"]}
 
 
 def test_a_valid_calibration_is_checked_after_each_press_without_notice(
@@ -64,7 +64,7 @@ def test_a_valid_calibration_is_checked_after_each_press_without_notice(
     found = health(rig)
     assert found["ok"]
     assert set(found) - {"ok"} == CODES - {"age"}  # the simulated calibration has no date
-    assert all(one["ok"] for name, one in found.items() if name != "ok")
+    assert all(check["ok"] for name, check in found.items() if name != "ok")
     assert rig.request("GET", "/api/status").json()["notices"] == []
 
 
@@ -117,7 +117,7 @@ def test_pictures_without_a_whole_eye_say_nothing_about_the_head(
         for _ in range(3):
             assert rig.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
             wait_until(lambda: not rig.exam.calibration_monitor.has_pending)
-    assert all(not one.report.verdict.is_good for one in rig.store.captures())
+    assert all(not capture.report.verdict.is_good for capture in rig.store.captures())
     found = health(rig)
     assert found["ok"]
     assert set(found) - {"ok"} == {"hot pixels", "black level"}, "the dark frames are judged, and nothing else"
@@ -225,7 +225,7 @@ def test_check_head_reads_the_stored_captures(make_rig: Any, wait_until: Callabl
     wait_until(lambda: not rig.exam.calibration_monitor.has_pending)
     found = check_calibration(specs[0], rig.store.folder, rig.clock, [].append)
     assert (found.captures, found.darks) == (2, 0)
-    assert {one.name for one in found.findings if one.fails} == {"psf", "age"}
+    assert {finding.name for finding in found.findings if finding.fails} == {"psf", "age"}
     lines = table(found).splitlines()
     assert lines[0].startswith("FAIL  age                  70 weeks  limit 61")
     assert lines[1] == f"      {CalibrationExpired.default_remedy}"

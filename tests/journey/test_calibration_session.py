@@ -299,7 +299,7 @@ def test_rollback_to_an_earlier_calibration_and_from_a_damaged_one(make_station:
     station.set_pin()
     first, second = station.calibrate(), station.calibrate()
     assert first != second
-    assert [one["id"] for one in station.state()["kept"]] == [second, first]
+    assert [calibration["id"] for calibration in station.state()["kept"]] == [second, first]
     until(lambda: station.state()["state"] == "idle")
     assert station.post("/api/calibration/use", {"id": first})["in_force"]["id"] == first
     memory = station.benches[-1].chips.memory
@@ -318,7 +318,10 @@ def test_rollback_to_an_earlier_calibration_and_from_a_damaged_one(make_station:
     reopened.post("/api/technician/unlock", {"pin": "1234"})
     state = reopened.state()
     assert state["needed"]["code"] == "calibration.damaged"
-    assert {one["id"]: one["damaged"] is None for one in state["kept"]} == {first: False, second: True}
+    assert {calibration["id"]: calibration["damaged"] is None for calibration in state["kept"]} == {
+        first: False,
+        second: True,
+    }
     assert reopened.refused("/api/calibration/use", {"id": first}) == (423, "calibration.damaged")
     state = reopened.post("/api/calibration/use", {"id": second})
     assert state["needed"] is None
@@ -492,10 +495,10 @@ def test_a_head_outside_its_limits_shows_readings_and_findings_and_keeps_its_cal
     assert run["rows"][1]["nominal"]["m_dpt"] == pytest.approx(-2 / (1 + 0.013 * 2))
     for row in run["rows"]:
         assert row["measured"]["m_dpt"] == pytest.approx(row["nominal"]["m_dpt"], abs=4 * row["sd"]["m_dpt"])
-    failing = [one for one in run["findings"] if not one["ok"]]
-    assert run["error"]["remedy"] in [one["remedy"] for one in failing]
+    failing = [finding for finding in run["findings"] if not finding["ok"]]
+    assert run["error"]["remedy"] in [finding["remedy"] for finding in failing]
     assert run["error"] == state["error"]
-    assert [one["id"] for one in state["kept"]] == [state["in_force"]["id"]] == [before]
+    assert [calibration["id"] for calibration in state["kept"]] == [state["in_force"]["id"]] == [before]
     assert "trial_offset_dpt" not in state["in_force"]["numbers"]
     assert calibrated.ask("POST", "/api/captures", {"eye": "OD"}).json()["calibration_id"] == before
 

@@ -51,9 +51,9 @@ def test_remote_clients_do_not_take_the_live_picture_from_a_local_one(rig: Rig) 
 
     async def preview_statuses(*hosts: str) -> list[int]:
         clients = [client_of(app, host) for host in hosts]
-        waits = [asyncio.create_task(one.get("/api/preview?after=0")) for one in clients]
+        waits = [asyncio.create_task(client.get("/api/preview?after=0")) for client in clients]
         answers = await asyncio.gather(*waits)
-        return [one.status_code for one in answers]
+        return [answer.status_code for answer in answers]
 
     remote = ("10.42.0.7", "10.42.0.7", "10.42.0.8", "10.42.0.9")
     statuses = asyncio.run(preview_statuses(*remote, "127.0.0.1", "127.0.0.1", "127.0.0.1"))
@@ -72,7 +72,7 @@ def test_waits_for_a_live_picture_hold_no_worker_thread(rig: Rig) -> None:
             waits = [asyncio.create_task(client.get("/api/preview?after=0")) for _ in range(MORE_THAN_WORKERS)]
             await asyncio.sleep(0.5)
             status = (await client.get("/api/status")).status_code
-            ended = sum(one.done() for one in waits)
+            ended = sum(wait.done() for wait in waits)
             await asyncio.gather(*waits)
         return status, ended
 

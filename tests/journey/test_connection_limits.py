@@ -134,7 +134,7 @@ def test_a_request_is_answered_among_more_idle_connections_than_permitted() -> N
         assert app.is_waiting.wait(10)
         idle = [undo.enter_context(closing(connected(port))) for _ in range(20)]
         assert get(port) == b"0"
-        assert all(is_closed(one) for one in idle[:16])
+        assert all(is_closed(connection) for connection in idle[:16])
         app.gate.set()
         assert answer_on(waiting) == b"0"
 
@@ -149,7 +149,7 @@ def test_a_new_connection_is_refused_while_all_are_answered() -> None:
             assert app.is_waiting.wait(10)
         assert is_closed(undo.enter_context(closing(connected(port))))
         app.gate.set()
-        assert [answer_on(one) for one in busy] == [b"0", b"0"]
+        assert [answer_on(connection) for connection in busy] == [b"0", b"0"]
 
 
 def test_a_tls_port_and_a_plain_port_share_one_limit(tmp_path: Path) -> None:

@@ -131,7 +131,9 @@ def test_capture_without_a_visit_stays_a_test_picture(old_rig: Rig) -> None:
         assert "again" in answer.json()["remedy"]
     assert old_rig.request("GET", f"/api/visits/{visit}").json() == before
     assert old_rig.request("GET", f"/api/captures/{made['id']}").json() == made
-    listed = {one["id"]: one["test"] for one in old_rig.request("GET", "/api/captures?limit=2").json()["captures"]}
+    listed = {
+        capture["id"]: capture["test"] for capture in old_rig.request("GET", "/api/captures?limit=2").json()["captures"]
+    }
     assert listed == {made["id"]: True, of_visit["id"]: False}
 
 

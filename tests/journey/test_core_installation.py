@@ -32,7 +32,10 @@ def without_the_extras(*words: str) -> subprocess.CompletedProcess[str]:
 def test_the_extra_is_what_the_message_is_about() -> None:
     """The packages of each extra are those that the message names; Starlette comes with FastAPI, Dask too."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    named = {name: {re.split(r"[^a-z]", one)[0] for one in extras[name]} for name in ("instrument", "archive")}
+    named = {
+        name: {re.split(r"[^a-z]", requirement)[0] for requirement in extras[name]}
+        for name in ("instrument", "archive")
+    }
     assert named["instrument"] | {"starlette"} == INSTRUMENT_PACKAGES
     assert named["archive"] | {"dask"} == ARCHIVE_PACKAGES
 

@@ -96,7 +96,7 @@ def test_bench_gives_one_table_with_the_peer_and_names_the_pair_that_fails(
         assert row["psnr_db"]["sd"] == pytest.approx(0, abs=1e-6), "both pairs are the same frame"
     assert rows["gradient"]["pcc"]["mean"] > rows["LenslessPiCam 1.0.8 ADMM, 100 rounds"]["pcc"]["mean"]
     assert len(facts["scores"]) == 6
-    assert [one["pair"] for one in facts["left_out"]] == ["eye3"]
+    assert [left_out["pair"] for left_out in facts["left_out"]] == ["eye3"]
 
 
 def test_bench_times_a_recording_without_truth(
@@ -121,7 +121,7 @@ def test_frontier_of_a_data_set_has_every_method_and_the_peer(
     assert run("frontier", "--data", tmp_path, "--repeats", 1, "--peers", peers, *out) == 0
     facts = json.loads((tmp_path / "f.json").read_text())
     assert facts["pairs"] == ["eye1", "eye2"]
-    assert [one["pair"] for one in facts["left_out"]] == ["eye3"]
+    assert [left_out["pair"] for left_out in facts["left_out"]] == ["eye3"]
     assert {row["pairs"] for row in facts["rows"]} == {2}
     names = {row["method"] for row in facts["rows"]}
     assert names >= {*METHODS, "choice in budget", "LenslessPiCam 1.0.8 ADMM, 40 rounds"}
@@ -140,7 +140,7 @@ def test_frontier_of_a_data_set_takes_no_frame(tmp_path: Path, capsys: pytest.Ca
 def test_the_peer_starts_again_after_a_failure(scene: Scene, peers: Path) -> None:
     with LenslessPeer(peers, (1, 2)) as peer:
         first = peer(scene.colour, scene.psf)
-        assert [(one.name, one.picture.shape) for one in first] == [
+        assert [(result.name, result.picture.shape) for result in first] == [
             ("LenslessPiCam 1.0.8 ADMM, 1 rounds", scene.colour.shape),
             ("LenslessPiCam 1.0.8 ADMM, 2 rounds", scene.colour.shape),
         ]

@@ -48,7 +48,7 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
     assert report["bin"] == 1
     assert [frame["used"] for frame in report["frames"]] == [True] * 4
     assert sum(frame["weight"] for frame in report["frames"]) == pytest.approx(1)
-    channels = {one["name"]: (one["predicted"], one["reason"]) for one in report["channels"]}
+    channels = {channel["name"]: (channel["predicted"], channel["reason"]) for channel in report["channels"]}
     assert channels == {"green": (False, None), "red": (False, None), "blue": (True, None)}
     assert "photochemical_dose" in report["limits_unchecked"]
     dose_j_per_cm2 = (98.9e-6 * 4 + 3.18e-6) * 0.1  # default radiometry: four exposures in green, one in red
@@ -226,8 +226,8 @@ def test_closed_frames_of_a_burst_are_left_out_of_the_picture(make_rig: Any, clo
     frames = kept.report.frames
     assert len(frames) == 4
     assert frames[0].used, "the first good frame is the reference"
-    assert [one.used for one in frames].count(True) == 4 - len(closed)
-    assert all(one.reason for one in frames if not one.used)
+    assert [frame.used for frame in frames].count(True) == 4 - len(closed)
+    assert all(frame.reason for frame in frames if not frame.used)
     *_, look = [data["url"] for kind, data in rig.published_events() if kind == "stage" and data["url"]]
     assert look.endswith("?reference") is (0 in closed), "a new URL for the look of another frame than the first"
     reference = read_raw_tiff(rig.store.read(kept.id, "raw.tiff"))[0].astype(float)

@@ -112,9 +112,9 @@ def test_capture_check_and_alert_agree_at_a_limit(
     rig.world.temperature_c, rig.world.battery_state = asking.BUS.warmest_c + above_c, BatteryState(charge, 3.5)
     observed = asking.post_capture(rig)
     assert (observed.code if refused else observed.way) == (refused or "verdict")
-    failed = {one["name"] for one in rig.request("GET", "/api/health").json()["checks"] if not one["ok"]}
+    failed = {check["name"] for check in rig.request("GET", "/api/health").json()["checks"] if not check["ok"]}
     assert failed & {"heat", "battery"} == {"head.hot": {"heat"}, "power.low": {"battery"}}.get(refused or "", set())
-    standing = {one["code"] for one in rig.request("GET", "/api/status").json()["standing"]}
+    standing = {alert["code"] for alert in rig.request("GET", "/api/status").json()["standing"]}
     assert {code for code in standing if code.startswith(("heat.", "batt."))} == active
 
 
@@ -225,7 +225,7 @@ def test_a_cross_site_request_for_live_pictures_is_refused_without_light(
 def laterality_question(rig: Rig) -> dict[str, Any] | None:
     """Return the active laterality question of the status, or None."""
     standing = rig.request("GET", "/api/status").json()["standing"]
-    return next((one for one in standing if one["code"] == "eye.side"), None)
+    return next((alert for alert in standing if alert["code"] == "eye.side"), None)
 
 
 def answer_laterality(rig: Rig, capture: str, eye: str) -> dict[str, Any]:

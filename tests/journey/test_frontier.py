@@ -72,11 +72,11 @@ def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, t
     assert all(set(point) == POINT for point in facts["points"])
     assert {point["method"] for point in facts["points"]} == set(METHODS)
     validated = {point["bin"]: point for point in facts["points"] if point["method"] == "tikhonov"}
-    assert {one["bin"] for one in facts["best_mu"]} == set(validated)
-    for one in facts["best_mu"]:  # best of eight weights, compared with the estimate from the frame alone
-        assert 1e-6 <= one["mu"] <= 3.2e-3
-        assert one["pcc"] > validated[one["bin"]]["pcc"] - 0.01
-        assert 0 < one["seconds_median"] < 5
+    assert {best["bin"] for best in facts["best_mu"]} == set(validated)
+    for best in facts["best_mu"]:  # best of eight weights, compared with the estimate from the frame alone
+        assert 1e-6 <= best["mu"] <= 3.2e-3
+        assert best["pcc"] > validated[best["bin"]]["pcc"] - 0.01
+        assert 0 < best["seconds_median"] < 5
     assert done.stdout.count("tikhonov with the best mu") == len(validated)
     assert {p["rounds"] for p in facts["points"] if p["method"] == "variation"} == {0, 1, 2, 4, 8, 12, 20}
     edge = sorted((p["seconds_median"], p["psnr_db"]) for p in facts["points"] if p["pareto"])
@@ -86,17 +86,17 @@ def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, t
     root = ElementTree.parse(plot).getroot()
     assert root.tag.endswith("svg")
     light = facts["light"]
-    assert [(one["frames"], one["used"]) for one in light] == [(n, n) for n in (1, 2, 4, 8)]
+    assert [(row["frames"], row["used"]) for row in light] == [(n, n) for n in (1, 2, 4, 8)]
     assert light[3]["dose_j_per_cm2"] == pytest.approx(8 * light[0]["dose_j_per_cm2"])
     assert light[0]["psnr_db"] == pytest.approx(facts["choice"]["psnr_db"], abs=1e-6), "one frame is the choice"
     assert light[3]["psnr_db"] > light[0]["psnr_db"] + 0.5  # eight times the light
-    bounds = [one["bound_psnr_db"] for one in light]
+    bounds = [row["bound_psnr_db"] for row in light]
     assert bounds == sorted(bounds)
     assert "8 frames (8 used)" in done.stdout
     assert "8 frames, " in plot.read_text()
-    embedded = [one.get("href") or "" for one in root.iter("{http://www.w3.org/2000/svg}image")]
+    embedded = [image.get("href") or "" for image in root.iter("{http://www.w3.org/2000/svg}image")]
     assert 3 <= len(embedded) <= 5, "pictures of two to four points, and the truth"
-    assert all(one.startswith("data:image/png;base64,") for one in embedded)
+    assert all(link.startswith("data:image/png;base64,") for link in embedded)
     assert facts["region"]["field_known"] is True
     assert "open, bin" not in plot.read_text()
     assert "Diabetic scene" in done.stderr

@@ -45,7 +45,7 @@ def test_an_idempotency_key_of_another_eye_visit_or_slot_is_refused_without_ligh
     taken = post_capture(rig, key="1" * 16, eye="OD")  # the key of the request that started a visit
     assert (taken.status_code, taken.json()["message"]) == (409, "key: it belongs to another request")
     assert post_capture(rig, **request_body).json()["id"] == kept.json()["id"]
-    assert [one.id for one in rig.store.captures()] == [kept.json()["id"]]
+    assert [capture.id for capture in rig.store.captures()] == [kept.json()["id"]]
 
 
 def test_an_idempotency_key_is_bound_while_its_capture_is_in_progress(rig: Any) -> None:
@@ -100,6 +100,6 @@ def test_the_status_reports_an_interrupted_test_picture_in_one_run_only(
     for _ in range(3):
         with ExitStack() as undo:
             rig = build(tmp_path, undo)
-            ids = [[one["id"] for one in rig.request("GET", "/api/status").json()["swept"]] for _ in range(2)]
+            ids = [[capture["id"] for capture in rig.request("GET", "/api/status").json()["swept"]] for _ in range(2)]
             reported.append(ids)
     assert reported == [[[lost.id], [lost.id]], [[], []], [[], []]]

@@ -138,7 +138,7 @@ def test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key(
         assert SHORTER.format(taken=lit, planned=4) in made.warnings
         assert bool({NO_DARK, CALIBRATION_DARK} & set(made.warnings)) is not dark
         assert made.method != "none"
-        assert {one.name: one.reason for one in made.channels}["red"] == INTERRUPTED
+        assert {channel.name: channel.reason for channel in made.channels}["red"] == INTERRUPTED
         green_j_per_cm2 = rig.exam.head.light.hazard.dose_j_per_cm2(
             Illumination("green"), lit * rig.exam.head.spec.camera.exposure_s
         )
@@ -160,7 +160,7 @@ def test_without_a_lit_frame_the_press_is_an_interrupted_capture(
     assert set(before.frames) == frames
     with ExitStack() as undo:
         rig = build(tmp_path, undo)
-        assert [one.eye for one in rig.exam.capture_journal.interrupted] == ["OD"]
+        assert [capture.eye for capture in rig.exam.capture_journal.interrupted] == ["OD"]
         assert rig.exam.press("OD", KEY, before.target).result(60).report.method != "none"
         assert rig.world.frames > 0
 
@@ -275,7 +275,7 @@ def killed_press(server: Server, process: subprocess.Popen[bytes], data: Path, k
         process.send_signal(signal.SIGKILL)
         assert pressed.exception(60) is not None, "the kill came too late, so the test shows nothing"
     process.wait()
-    (id,) = [one.name for one in (data / "journal").iterdir() if one.is_dir()]
+    (id,) = [path.name for path in (data / "journal").iterdir() if path.is_dir()]
     assert not (data / "captures" / id).exists(), "the kill came too late, so the test shows nothing"
     return KilledPress(id, request, written(data))
 

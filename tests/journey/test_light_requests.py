@@ -63,7 +63,7 @@ def test_all_light_is_counted_for_the_named_eye(make_rig: MakeRig, eye: Eye, in_
     assert live_status(rig, f"&eye={eye}{visit}") == 200
     doses.append(doses_j_per_cm2(rig))
     assert doses[0][eye] < doses[1][eye] < doses[2][eye]
-    assert len({one[OTHER_EYE[eye]] for one in doses}) == 1
+    assert len({dose[OTHER_EYE[eye]] for dose in doses}) == 1
 
 
 def test_light_without_a_visit_ends_while_a_visit_gets_light(make_rig: MakeRig) -> None:
@@ -114,7 +114,7 @@ def test_the_probe_takes_a_live_picture_although_a_screen_holds_the_lease(make_r
     rig, screen = make_rig(), secrets.token_hex(8)
     assert request_lease(rig, screen)
     with served(rig.app, ConnectionLimits()) as (port,):
-        checks = {one.name: one for one in probe_instrument(f"http://127.0.0.1:{port}", with_picture=True)}
+        checks = {check.name: check for check in probe_instrument(f"http://127.0.0.1:{port}", with_picture=True)}
         rig.event_bus.close()
     assert checks["picture"].ok, checks["picture"].value
     rig.clock.elapsed_s += 3

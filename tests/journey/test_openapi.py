@@ -105,8 +105,8 @@ def answers(document: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
 def models() -> list[type[BaseModel]]:
     """Return every model of services/http/schemas."""
     found = []
-    for one in pkgutil.iter_modules(schemas.__path__):
-        members = vars(importlib.import_module(f"{schemas.__name__}.{one.name}")).values()
+    for module in pkgutil.iter_modules(schemas.__path__):
+        members = vars(importlib.import_module(f"{schemas.__name__}.{module.name}")).values()
         found += [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
     return found
 

@@ -56,7 +56,7 @@ def test_an_exported_visit_is_removed_and_brought_back(rig: Rig, ask: Callable[.
         gone = rig.request("GET", f"/api/captures/{capture}/{name}")
         assert (gone.status_code, gone.json()["code"]) == (410, "store.removed")
     assert rig.request("GET", f"/api/captures/{capture}/quick.jpg").status_code == 200
-    checks = {one["name"]: one["ok"] for one in rig.request("GET", "/api/health").json()["checks"]}
+    checks = {check["name"]: check["ok"] for check in rig.request("GET", "/api/health").json()["checks"]}
     assert checks["captures"]
     assert rig.request("GET", f"/api/visits/{visit}").json()["slots"]["R-centre"]["capture"] == capture
     assert ask("POST", "/undo").json()["undoable_captures"] == 0

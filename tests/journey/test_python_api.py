@@ -68,7 +68,7 @@ def test_pictures_of_simulated_counts_are_marked(scene: diffuscope.SimulatedScen
 
 def test_a_scene_is_simulated_by_name_and_by_chosen_effects() -> None:
     plan = diffuscope.simulate("healthy", only=["shot"]).plan
-    assert [one.name for one in plan.values() if one.simulated] == ["shot"]
+    assert [decision.name for decision in plan.values() if decision.simulated] == ["shot"]
 
 
 shapes = st.tuples(st.integers(20, 60), st.integers(20, 60))
@@ -157,7 +157,9 @@ def test_a_residual_that_noise_does_not_explain_is_said(scene: diffuscope.Simula
     made = diffuscope.reconstruct(spoilt, scene.psf, method="gradient")
     assert made.report.residual is not None
     assert made.report.residual > 3
-    assert any(f"The residual is {made.report.residual:.1f} times the noise" in one for one in made.report.warnings)
+    assert any(
+        f"The residual is {made.report.residual:.1f} times the noise" in warning for warning in made.report.warnings
+    )
 
 
 def test_a_pair_of_a_data_set_is_reconstructed_and_stays_simulated(

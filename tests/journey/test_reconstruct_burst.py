@@ -41,7 +41,7 @@ def test_a_burst_gives_one_picture_and_its_report_names_every_frame(folder: Path
     assert done.code == 0, done.err
     assert "lid.npy was left out" in done.err
     report = json.loads((folder / "report.json").read_text())
-    assert [one["used"] for one in report["frames"]] == [True, True, False, True]
+    assert [use["used"] for use in report["frames"]] == [True, True, False, True]
     assert report["frames"][0]["shift_px"] == [0, 0]
     for place, moved_px in ((1, DRIFT_PX[1]), (3, DRIFT_PX[2])):
         assert report["frames"][place]["shift_px"] == pytest.approx(moved_px, abs=0.3)  # a sixth of a sample
@@ -57,9 +57,9 @@ def test_a_frame_without_values_is_left_out_and_a_smaller_one_is_refused(folder:
     assert done.code == 0, done.err
     text = (folder / "report.json").read_text()
     report = json.loads(text)
-    assert [one["used"] for one in report["frames"]] == [True, False, True]
+    assert [use["used"] for use in report["frames"]] == [True, False, True]
     assert "not numbers" in report["frames"][1]["reason"]
-    assert any(one.startswith("nan.npy was left out") for one in report["warnings"])
+    assert any(warning.startswith("nan.npy was left out") for warning in report["warnings"])
     assert str(folder) not in text, "a report is read by others, too: it names files, not folders"
     assert "344 x 480 pixels" in refusal(call(reconstruct(folder, "0.npy", "small.npy")))
     assert "no frame of the burst can be used" in refusal(call(reconstruct(folder, "nan.npy", "nan.npy")))
@@ -112,7 +112,7 @@ def test_the_same_exposure_twice_is_no_burst(folder: Path) -> None:
     np.save(folder / "copy.npy", np.load(folder / "1.npy"))
     assert "holds the same pixels as" in refusal(call(reconstruct(folder, "0.npy", "1.npy", "copy.npy")))
     channels = [word for name in ("0.npy", "0.npy") for word in ("--channel", "green", name, "psf.npy")]
-    words = ["reconstruct", *(str(folder / one) if one.endswith(".npy") else one for one in channels)]
+    words = ["reconstruct", *(str(folder / word) if word.endswith(".npy") else word for word in channels)]
     words += ["--channel", "red", str(folder / "1.npy"), str(folder / "psf.npy"), "-o", str(folder / "x.npy")]
     assert "holds the same pixels as" in refusal(call(words))
 

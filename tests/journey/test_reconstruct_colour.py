@@ -37,8 +37,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reconstruct(folder: Path, *channels: str, out: str = "out.npy") -> list[str]:
     """Return the words of the command for channels such as `red=red.npy`."""
     words = ["reconstruct", "-o", str(folder / out), "--report", str(folder / "report.json")]
-    for one in channels:
-        name, _, file = one.partition("=")
+    for channel in channels:
+        name, _, file = channel.partition("=")
         words += ["--channel", name, str(folder / file), str(folder / "psf.npy")]
     return words
 
@@ -54,14 +54,14 @@ def test_red_and_two_greens_give_a_colour_picture_with_a_predicted_blue(folder: 
     assert done.code == 0, done.err
     assert "blue is predicted" in done.err
     report = json.loads((folder / "report.json").read_text())
-    assert [(one["name"], one["predicted"]) for one in report["channels"]] == [
+    assert [(channel["name"], channel["predicted"]) for channel in report["channels"]] == [
         ("green", False),
         ("red", False),
         ("blue", True),
     ]
     assert report["channels"][1]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)  # a quarter of a sample
     assert report["channels"][2]["shift_px"] is None
-    assert [one["index"] for one in report["frames"]] == [0, 1], "frames are those of the burst, as in a press"
+    assert [use["index"] for use in report["frames"]] == [0, 1], "frames are those of the burst, as in a press"
     assert report["frames"][1]["shift_px"] == pytest.approx(SHIFTS_PX["green2"], abs=0.3)  # as in bursts
     picture = np.load(folder / "out.npy")
     assert picture.shape == (*SHAPE, 3)

@@ -136,7 +136,7 @@ def test_a_press_on_a_recording_that_is_resumed_with_its_one_frame_is_whole(
             plans,
             lambda: None,
             Watchdog(None),
-            resumed_target=lambda one: CaptureTarget(frames=one.planned, colours=one.colours),
+            resumed_target=lambda interrupted: CaptureTarget(frames=interrupted.planned, colours=interrupted.colours),
         )
         capture = exam.press("OD", key).result(60)
         exam.close()

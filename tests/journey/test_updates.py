@@ -143,8 +143,8 @@ def test_each_unsuitable_bundle_is_listed_with_its_error(page: Page) -> None:
     (board.stick / "damaged.raucb").write_bytes(b"no bundle")
     (board.stick / "link.raucb").symlink_to("/etc/passwd")
     (board.stick / "folder.raucb").mkdir()
-    found = {one["name"]: one for one in page.looked()["found"]}
-    assert {name: one["trouble"]["code"] for name, one in found.items()} == {
+    found = {bundle["name"]: bundle for bundle in page.looked()["found"]}
+    assert {name: bundle["trouble"]["code"] for name, bundle in found.items()} == {
         "foreign.raucb": "update.foreign",
         "other.raucb": "update.device",
         "older.raucb": "update.older",
@@ -159,7 +159,7 @@ def test_each_unsuitable_bundle_is_listed_with_its_error(page: Page) -> None:
 def test_each_refused_install_has_its_code(page: Page) -> None:
     board = page.board
     small, gone = board.bundle("small.raucb", slot="small"), board.bundle("gone.raucb")
-    ids = {one["name"]: one["id"] for one in page.looked()["found"]}
+    ids = {bundle["name"]: bundle["id"] for bundle in page.looked()["found"]}
     assert page.installed(ids[small.name])["trouble"]["code"] == "update.room"
     gone.unlink()
     assert page.installed(ids[gone.name])["trouble"]["code"] == "update.stick"

@@ -70,8 +70,8 @@ def test_a_budget_that_is_over_before_the_colours_leaves_none_out(make_rig: Make
     visit = begin(rig)
     made = [press(rig, visit, slot) for slot in SLOTS]
     clock.tick_s = 0.0
-    assert {one["report"]["stopped"] for one in made} == {"deadline"}
-    assert all("colour" in one["links"] for one in made)
+    assert {capture["report"]["stopped"] for capture in made} == {"deadline"}
+    assert all("colour" in capture["links"] for capture in made)
     assert why_green(rig, visit) is None
 
 
@@ -84,7 +84,7 @@ def test_one_picture_without_colour_shows_its_visit_in_green_and_takes_no_more_r
     assert "colour" in press(rig, visit, "R-centre")["links"]
     assert why_green(rig, visit) is None
     camera.fails = True
-    red = next(one for one in press(rig, visit, "R-nerve")["report"]["channels"] if one["name"] == "red")
+    red = next(channel for channel in press(rig, visit, "R-nerve")["report"]["channels"] if channel["name"] == "red")
     assert (red["reason"], red["code"]) == ("no frame came", "camera.stalled")
     assert why_green(rig, visit) == "camera.stalled"
     camera.fails = False

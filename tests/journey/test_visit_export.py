@@ -79,7 +79,7 @@ def test_a_date_before_1980_does_not_fail_the_zip() -> None:
 
 def test_a_copy_on_a_usb_drive_is_complete_and_an_earlier_one_stays(rig: Any, visit: Any, stick: Path) -> None:
     listed = rig.request("GET", "/api/exports").json()["folders"]
-    assert [(one["id"], one["name"]) for one in listed] == [(drive_id(stick), "USB STICK")]
+    assert [(drive["id"], drive["name"]) for drive in listed] == [(drive_id(stick), "USB STICK")]
     assert listed[0]["free_bytes"] > 0
     order = {"key": next(keys), "folder": drive_id(stick)}
     at = f"/api/visits/{visit['id']}/export"
@@ -88,7 +88,7 @@ def test_a_copy_on_a_usb_drive_is_complete_and_an_earlier_one_stays(rig: Any, vi
     check(stick.parent / made["folder"])
     other = rig.request("POST", at, json={**order, "key": next(keys)}).json()
     check(stick.parent / other["folder"])
-    assert {path.name for path in stick.iterdir()} == {Path(one["folder"]).name for one in (made, other)}
+    assert {path.name for path in stick.iterdir()} == {Path(export["folder"]).name for export in (made, other)}
     assert len(list(stick.iterdir())) == 2
 
 
@@ -159,7 +159,7 @@ def test_a_drive_that_can_only_be_read_is_listed_as_such_and_refused(rig: Any, v
     """As a stick whose switch is on, or one that the kernel has mounted read-only after an error."""
     with read_only(stick):
         listed = rig.request("GET", "/api/exports").json()["folders"]
-        assert [(one["name"], one["is_writable"]) for one in listed] == [("USB STICK", False)]
+        assert [(drive["name"], drive["is_writable"]) for drive in listed] == [("USB STICK", False)]
         order = {"key": next(keys), "folder": drive_id(stick)}
         refused = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order)
         assert (refused.status_code, refused.json()["code"]) == (503, "stick.readonly")

@@ -56,7 +56,7 @@ def test_two_fields_of_one_eye_become_one_picture(eye_rig: Rig) -> None:
     eye_rig.clock.sleep(AIMING_S + 1)
     joined = known_montage(eye_rig, visit)
     assert (joined["state"], joined["pictures"]) == ("joined", 2)
-    assert [one["capture"] for one in joined["placed"]] == [first["id"], second["id"]], "of this eye only"
+    assert [place["capture"] for place in joined["placed"]] == [first["id"], second["id"]], "of this eye only"
     placed = joined["placed"][1]
     assert placed["used"], placed
     right_px, down_px = (turn * eye_rig.world.geometry.px_per_deg for turn in FIXATION_DEG["nerve"])
@@ -68,8 +68,8 @@ def test_two_fields_of_one_eye_become_one_picture(eye_rig: Rig) -> None:
     with Pillow.open(BytesIO(content.content)) as image:
         assert image.info["simulated"] == "true"
         shown = np.asarray(image)
-    with Pillow.open(BytesIO(eye_rig.store.read(first["id"], "picture.png"))) as one:
-        assert shown.shape[1] > 1.2 * one.width, "wider than one field"
+    with Pillow.open(BytesIO(eye_rig.store.read(first["id"], "picture.png"))) as field:
+        assert shown.shape[1] > 1.2 * field.width, "wider than one field"
     rows = round(shown.shape[0] / 18)  # letters of the mark in the bottom left corner, which is in no field
     assert (shown[-rows:, : 3 * rows] > 200).any(), "the band"
     assert montage(eye_rig, visit)["digest"] == joined["digest"]
@@ -101,7 +101,7 @@ def test_pictures_that_do_not_fit_stay_apart_with_the_reason(simulated: bool) ->
     smaller = to_png(gaze(WIDE_RETINA, (0, 0))[2:], simulated)
     made = join_pictures([first, second, smaller], simulated, None, nothing)
     assert made.png is None
-    assert [one.used for one in made.placed] == [True, False, False]
+    assert [place.used for place in made.placed] == [True, False, False]
     assert "no picture shows the same part" in (made.placed[1].reason or "")
     assert made.placed[2].reason == "it was taken with another calibration"
 

@@ -125,8 +125,8 @@ def test_a_wall_instead_of_an_eye_is_reported_before_the_reconstruction(make_rig
     rig.clock.elapsed_s += 60  # with the lamp off; so that the wall does not count as the lid of the earlier eye
     rig.world.faults.add("eye.closed")  # a wall reflects uniformly, as a lid does
     causes = [shoot(rig, visit, "R-centre")["verdict"] for _ in range(4)]
-    assert {one["word"] for one in causes} == {"again"}
-    assert [one["code"] for one in causes] == ["shot.noeye"] * 2 + ["shot.poor"] * 2
+    assert {cause["word"] for cause in causes} == {"again"}
+    assert [cause["code"] for cause in causes] == ["shot.noeye"] * 2 + ["shot.poor"] * 2
     slot = rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
     assert (slot["state"], slot["tries"]) == ("taken", 4)  # the poor picture, never an empty slot
     assert slot["verdict"]["code"] == "shot.poor"
@@ -142,7 +142,7 @@ def test_a_wall_instead_of_an_eye_is_reported_before_the_reconstruction(make_rig
     assert shoot(rig, visit, "R-centre")["verdict"]["word"] == "good"
     assert rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]["verdict"]["word"] == "good"
     aims = [data for kind, data in rig.published_events() if kind == "aim"]
-    assert [one["code"] for one in aims][:2] == ["ready", "noeye"]
+    assert [data["code"] for data in aims][:2] == ["ready", "noeye"]
 
 
 def test_saturation_is_reported_without_a_reconstruction(make_rig: Any) -> None:

@@ -55,7 +55,7 @@ def complete_captures(data: Path) -> set[str]:
     return {
         path.parent.name
         for path in data.glob("*/*/raw.tiff")
-        if {one.name for one in path.parent.iterdir()} >= REQUIRED_FILES
+        if {file.name for file in path.parent.iterdir()} >= REQUIRED_FILES
     }
 
 
@@ -75,7 +75,7 @@ def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
             with Server(served_head, folder, environment).running():
                 pass
         with CaptureStore(folder, reserve_bytes=0) as store:
-            listed = {one.id for one in store.captures()}
+            listed = {capture.id for capture in store.captures()}
             assert listed == set(kept), flipped
             assert not store.quarantine.sizes_bytes(), flipped
             adopted += len(store.recovery.adopted)

@@ -68,10 +68,10 @@ def write_results(
     results.prepare(plan)
     report = {"method": "variation", "channels": [asdict(ChannelUse("blue", None, predicted=True))]}
     document = {"report": report, "simulated": simulated, "field_px": [1, 5, 1, 7]}
-    for one in captures:
-        if one.id not in without:
+    for capture in captures:
+        if capture.id not in without:
             pictures = {"picture.tiff": encoded(picture), "colour.tiff": encoded(np.stack([picture[1:5, 1:7]] * 3, 2))}
-            results.add(one.result, pictures | {"report.json": json.dumps(document).encode(), "run.json": b"{}"})
+            results.add(capture.result, pictures | {"report.json": json.dumps(document).encode(), "run.json": b"{}"})
     return folder
 
 
@@ -119,8 +119,8 @@ def test_what_does_not_belong_to_the_store_is_refused_and_the_rest_adopted(store
         first.model_copy(update={"result": "5" * 32, "origin": ELSEWHERE}),
     ]
     done = adopted(write_results(tmp_path / "out", captures), store)
-    assert (done.adopted, [one.id for one in done.refused]) == (1, ["two", "three", "four", "one"])
-    frames, unknown, foreign, of_another = (f"{one.reason}. {one.remedy}" for one in done.refused)
+    assert (done.adopted, [refusal.id for refusal in done.refused]) == (1, ["two", "three", "four", "one"])
+    frames, unknown, foreign, of_another = (f"{refusal.reason}. {refusal.remedy}" for refusal in done.refused)
     assert "holds other frames" in frames
     assert "raw.tiff. Plan and run the archive again" in frames
     assert "no capture named 'three'. Give the store that holds it." in unknown

@@ -38,10 +38,10 @@ def plan_of(*sources: Path, settings: PlanSettings | None = None) -> Plan:
 
 def test_a_plan_lists_each_frame_with_its_digests_and_survives_a_file(scene: Scene, tmp_path: Path) -> None:
     plan = plan_of(recording(tmp_path / "a", scene))
-    assert [one.id for one in plan.captures] == ["eye0", "eye1", "eye2"]
+    assert [capture.id for capture in plan.captures] == ["eye0", "eye1", "eye2"]
     assert len(plan.calibrations) == 1
-    assert len({one.result for one in plan.captures}) == 3
-    assert all(len(one.result) == NAME_DIGITS for one in plan.captures)
+    assert len({capture.result for capture in plan.captures}) == 3
+    assert all(len(capture.result) == NAME_DIGITS for capture in plan.captures)
     write_plan(plan, tmp_path / "plan.toml")
     assert read_plan(tmp_path / "plan.toml") == plan
 
@@ -69,7 +69,7 @@ def test_a_frame_of_equal_content_is_planned_once(scene: Scene, tmp_path: Path) 
     (folder / "eye9.tiff").write_bytes((folder / "eye0.tiff").read_bytes())
     plan = plan_of(folder, recording(tmp_path / "b", scene, 1))
     assert len(plan.captures) == 2
-    assert {one.reason for one in plan.left_out} == {"it has the same content as eye0"}
+    assert {left_out.reason for left_out in plan.left_out} == {"it has the same content as eye0"}
 
 
 def test_a_scene_and_own_pairs_are_sources_with_their_truth(scene: Scene, tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_a_store_is_read_by_its_records_and_left_as_it_is(scene: Scene, tmp_path
     assert (planned.id, planned.device, planned.eye) == ("a", "tiny-head", "OD")
     assert planned.dark.endswith("dark.tiff")
     assert plan.calibrations[0].id == id
-    assert [one.id for one in plan.left_out] == ["b", "c"]
+    assert [left_out.id for left_out in plan.left_out] == ["b", "c"]
     assert "was removed" in plan.left_out[0].reason
     assert "0123456789abcdef is in no source" in plan.left_out[1].reason
 
@@ -118,7 +118,7 @@ def test_an_empty_frame_is_left_out_and_a_folder_without_psf_says_so(scene: Scen
     folder = recording(tmp_path / "a", scene, 2)
     (folder / "eye1.tiff").write_bytes(b"")
     plan = plan_of(folder)
-    assert [one.reason for one in plan.left_out] == ["its raw frame is an empty file"]
+    assert [left_out.reason for left_out in plan.left_out] == ["its raw frame is an empty file"]
     (folder / "psf.tiff").unlink()
     with pytest.raises(SettingError, match=r"2 images, but no psf\.tiff"):
         plan_of(folder)
@@ -183,11 +183,11 @@ def test_frames_of_one_name_are_one_capture_in_every_kind_of_folder(scene: Scene
         (scenes, "a", ["a"]),
     ):
         plan = plan_of(source)
-        assert [one.id for one in plan.captures] == ids
+        assert [capture.id for capture in plan.captures] == ids
         frames = plan.captures[ids.index(first)].frames
-        assert [Path(one.path).stem.rpartition("-")[2] for one in frames] == ["1", "2", "red", "blue"]
-        assert [one.colour for one in frames] == ["", "", "red", "blue"]
-        assert [one.role for one in plan.calibrations[0].files] == ["psf", "psf-red"]
+        assert [Path(frame.path).stem.rpartition("-")[2] for frame in frames] == ["1", "2", "red", "blue"]
+        assert [frame.colour for frame in frames] == ["", "", "red", "blue"]
+        assert [file.role for file in plan.calibrations[0].files] == ["psf", "psf-red"]
 
 
 def test_a_stored_burst_is_planned_whole_with_what_the_instrument_left_out(scene: Scene, tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_a_stored_burst_is_planned_whole_with_what_the_instrument_left_out(scene
             capture = Capture(name, "OD", VirtualClock().wall(), True, id, report, {})
             store.save(capture, files | {"raw.tiff": name.encode(), "report.json": b"{}"})
     (first, second) = plan_of(tmp_path).captures
-    assert [(Path(one.path).name, one.colour, one.unusable) for one in first.frames] == [
+    assert [(Path(frame.path).name, frame.colour, frame.unusable) for frame in first.frames] == [
         ("raw-1.tiff", "", "frame quality: shot.moved"),
         ("raw-2.tiff", "", ""),
         ("raw-red.tiff", "red", ""),

@@ -101,7 +101,9 @@ def test_every_file_of_the_store_is_restored_bit_for_bit(
     def files(folder: Path) -> dict[str, tuple[bytes, int]]:
         paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
         found = {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mode) for path in paths}
-        return {name: one for name, one in found.items() if not name.startswith(("store.sqlite", ".lock", "snapshots"))}
+        return {
+            name: file for name, file in found.items() if not name.startswith(("store.sqlite", ".lock", "snapshots"))
+        }
 
     assert files(tmp_path / "new") == files(store) | {"backup.json": files(tmp_path / "new")["backup.json"]}
     assert read_key(tmp_path / "new") == key
@@ -302,7 +304,7 @@ def test_one_copy_of_the_header_is_enough(store: Path, stick: Path, tmp_path: Pa
     (find_folder(stick) / name).write_bytes(b"\0" * 100)
     restored_from(stick, tmp_path / "new")
     write_backup(store, stick, CLOCK, quiet)
-    contents = {(find_folder(stick) / one).read_bytes() for one in HEADER_FILES}
+    contents = {(find_folder(stick) / file).read_bytes() for file in HEADER_FILES}
     assert len(contents) == 1, "the damaged copy is written again"
 
 

@@ -46,10 +46,10 @@ def test_every_pad_has_the_net_of_the_schematic(name: str) -> None:
 @pytest.mark.parametrize("name", ["gate", "ring"])
 def test_every_swap_of_two_pads_of_a_component_is_found(name: str) -> None:
     pads = board(name).pads
-    for one, other in itertools.combinations(pads, 2):
-        if one[0] == other[0] and pads[one].net != pads[other].net:
-            swapped = {one: replace(pads[one], net=pads[other].net), other: replace(pads[other], net=pads[one].net)}
-            assert wrong_pads(name, replace(board(name), pads=pads | swapped)), f"{one} and {other}"
+    for left, right in itertools.combinations(pads, 2):
+        if left[0] == right[0] and pads[left].net != pads[right].net:
+            swapped = {left: replace(pads[left], net=pads[right].net), right: replace(pads[right], net=pads[left].net)}
+            assert wrong_pads(name, replace(board(name), pads=pads | swapped)), f"{left} and {right}"
 
 
 def misplaced_leds(pads: dict[Pin, Pad]) -> set[str]:
@@ -70,9 +70,9 @@ def misplaced_leds(pads: dict[Pin, Pad]) -> set[str]:
 def test_leds_are_where_the_head_file_has_them() -> None:
     pads = board("ring").pads
     assert misplaced_leds(pads) == set()
-    for one, other in itertools.combinations([f"D{number}" for number in range(1, 9)], 2):
-        exchanged = {(one, number): pads[other, number] for number in "12"}
-        assert misplaced_leds(pads | exchanged) == {one}
+    for left, right in itertools.combinations([f"D{number}" for number in range(1, 9)], 2):
+        exchanged = {(left, number): pads[right, number] for number in "12"}
+        assert misplaced_leds(pads | exchanged) == {left}
     turned = {("D1", "1"): pads["D1", "2"], ("D1", "2"): pads["D1", "1"]}
     assert misplaced_leds(pads | turned) == {"D1"}
 

@@ -97,10 +97,10 @@ def test_noise_is_not_taken_for_motion_blur(join: BurstJoiner, peaks_e: tuple[fl
 
 
 def test_a_burst_with_one_usable_frame_is_that_frame(calibration: Calibration, join: BurstJoiner) -> None:
-    one, blank = frame(seen(RETINA, (0, 0)), 5000, 1), np.full(SHAPE, 4095, np.uint16)
-    joined = join([blank, one])
+    usable, blank = frame(seen(RETINA, (0, 0)), 5000, 1), np.full(SHAPE, 4095, np.uint16)
+    joined = join([blank, usable])
     assert [use.used for use in joined.frames] == [False, True]
-    picture, alone = solved_burst(calibration, one, joined), solved(calibration, one)
+    picture, alone = solved_burst(calibration, usable, joined), solved(calibration, usable)
     assert np.abs(picture - alone).max() < 0.02 * alone.max()  # single precision of the linearised frame
     with pytest.raises(FrameError, match="no frame of the burst can be used"):
         join([blank, blank])

@@ -50,18 +50,19 @@ def test_a_burst_gives_one_quick_look_pauses_and_one_better_picture(bursts: Burs
     assert isinstance(steps[0], StageResult)
     assert [look.last for look in looks] == [False, True]
     assert sum(isinstance(step, RoundDone) for step in steps) >= COUNT
-    one, made = picture(bursts, frames[:1]), steps[-1]
+    alone, made = picture(bursts, frames[:1]), steps[-1]
     assert isinstance(made, Reconstruction)
     assert made.simulated
-    assert psnr_db(made.picture, truth()) > psnr_db(one.picture, truth()) + 0.7  # two of three decibels of a still eye
+    # two of three decibels of a still eye
+    assert psnr_db(made.picture, truth()) > psnr_db(alone.picture, truth()) + 0.7
     assert [use.used for use in made.report.frames] == [True] * COUNT
     assert made.report.seconds["join"] > 0
 
 
 def test_a_burst_is_in_dn_of_one_exposure(bursts: BurstReconstructor, frames: list) -> None:
-    one, made = picture(bursts, frames[:1]), picture(bursts, frames)
-    assert made.picture.mean() == pytest.approx(one.picture.mean(), rel=0.02)  # the noise of one frame
-    figures, of_one = made.report, one.report
+    alone, made = picture(bursts, frames[:1]), picture(bursts, frames)
+    assert made.picture.mean() == pytest.approx(alone.picture.mean(), rel=0.02)  # the noise of one frame
+    figures, of_one = made.report, alone.report
     assert figures.quality["mean_dn"] == pytest.approx(of_one.quality["mean_dn"], rel=0.01)
     assert figures.noise_dn == pytest.approx(of_one.noise_dn / COUNT**0.5, rel=0.1)
     assert figures.regularisation["flat_dn"] == pytest.approx(of_one.regularisation["flat_dn"], rel=0.05)

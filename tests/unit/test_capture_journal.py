@@ -38,8 +38,8 @@ def test_a_stored_capture_is_not_interrupted_and_a_damaged_entry_still_gives_its
         InterruptedCapture("20260301T120001-OD-cd", "OD"),
     )
     assert not (folder / f"{kept.id}.json").exists()
-    found.discard(lambda one: one.eye == "OS")
-    assert [one.eye for one in CaptureJournal(store).interrupted] == ["OD"]
+    found.discard(lambda capture: capture.eye == "OS")
+    assert [capture.eye for capture in CaptureJournal(store).interrupted] == ["OD"]
 
 
 def test_a_test_picture_is_reported_in_one_run_and_a_picture_of_a_visit_until_it_is_repeated(
@@ -75,9 +75,9 @@ def test_an_interrupted_press_with_a_lit_frame_is_resumable_with_its_key_and_pla
     press_with_frames(store)
     found = CaptureJournal(store)
     assert found.interrupted == ()
-    (one,) = found.resumable
-    assert (one.press, one.key, one.planned, one.colours) == (PRESS, KEY, 3, ("red",))
-    assert [frame.file.path.name for frame in one.frames] == ["raw.tiff", "raw-1.tiff"]
+    (capture,) = found.resumable
+    assert (capture.press, capture.key, capture.planned, capture.colours) == (PRESS, KEY, 3, ("red",))
+    assert [frame.file.path.name for frame in capture.frames] == ["raw.tiff", "raw-1.tiff"]
     found.end(PRESS.id)
     assert found.resumable == ()
     assert list((store.folder / "journal").iterdir()) == []
@@ -114,7 +114,7 @@ def test_a_failed_resumption_is_an_interrupted_capture_and_two_lost_attempts_end
     press_with_frames(store)
     for _ in range(MAX_ATTEMPTS):
         journal = CaptureJournal(store)
-        assert [one.press for one in journal.resumable] == [PRESS]
+        assert [capture.press for capture in journal.resumable] == [PRESS]
         journal.count_attempt(PRESS.id)  # and the process is killed
     assert (CaptureJournal(store).interrupted, CaptureJournal(store).resumable) == ((PRESS,), ())
 
@@ -125,15 +125,15 @@ def test_frames_of_an_entry_that_does_not_name_its_target_are_not_resumed(store:
     (store.folder / "journal" / f"{PRESS.id}.json").write_bytes(entry)
     found = CaptureJournal(store)
     assert found.resumable == ()
-    assert [(one.id, one.eye, one.visit) for one in found.interrupted] == [(PRESS.id, "OD", None)]
+    assert [(capture.id, capture.eye, capture.visit) for capture in found.interrupted] == [(PRESS.id, "OD", None)]
     assert not (store.folder / "journal" / PRESS.id).exists()
 
 
 def test_files_of_the_writer_are_linked_into_the_capture_and_outlast_the_journal(store: CaptureStore) -> None:
     press_with_frames(store)
     journal = CaptureJournal(store)
-    (one,) = journal.resumable
-    files = {frame.file.path.name: frame.file for frame in one.frames}
+    (capture,) = journal.resumable
+    files = {frame.file.path.name: frame.file for frame in capture.frames}
     before = {name: file.path.read_bytes() for name, file in files.items()}
     inode = files["raw.tiff"].path.stat().st_ino
     kept = store.save(Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {**files, "report.json": b"{}"})

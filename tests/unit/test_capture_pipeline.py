@@ -292,7 +292,7 @@ def test_a_stall_before_the_other_colours_leaves_the_split_frames_and_its_reason
     split = ExposureSplit(2, motion_deg=1.0, gain_db=1.0, part_s=head.spec.camera.exposure_s / 2)
     exposure = expose_press(head, ("OD",), bench.clock, count=2, colours=["red", "blue"], split=split)
     assert (len(exposure.lit), dict(exposure.colours)) == (4, {})
-    assert [(one.name, one.reason, one.code) for one in exposure.missing] == [
+    assert [(channel.name, channel.reason, channel.code) for channel in exposure.missing] == [
         (colour, "the sensor did not change its exposure", "camera.stalled") for colour in ("red", "blue")
     ]
     assert bench.world.illumination is None
@@ -344,8 +344,8 @@ def seen_lights(bench: Bench, *, white: bool, spoil: bool = False) -> Mapping[Co
     taken = expose_press(head, ("OD",), bench.clock, colours=["red"])
     shot = replace(bench.exposed(), exposure=taken)
     if spoil:
-        cut = {colour: replace(one, counts=one.counts[::2]) for colour, one in taken.colours.items()}
-        lit = tuple(replace(one, counts=one.counts[::2]) for one in taken.lit)
+        cut = {colour: replace(frame, counts=frame.counts[::2]) for colour, frame in taken.colours.items()}
+        lit = tuple(replace(frame, counts=frame.counts[::2]) for frame in taken.lit)
         shot = replace(shot, exposure=replace(taken, lit=lit, colours=cut))
     assert isinstance(list(pipeline.reconstruct(shot, budget_s=5.0))[-1], Reconstruction)
     frames = {"green": taken.lit[0], "red": taken.colours["red"]}
@@ -353,8 +353,8 @@ def seen_lights(bench: Bench, *, white: bool, spoil: bool = False) -> Mapping[Co
     if white and not spoil:
         dark_dn = float(taken.dark.counts.mean())
         assert colours.lights_dn_per_s == {
-            colour: pytest.approx((float(one.counts.mean()) - dark_dn) / one.exposure_s)
-            for colour, one in frames.items()
+            colour: pytest.approx((float(frame.counts.mean()) - dark_dn) / frame.exposure_s)
+            for colour, frame in frames.items()
         }
     return colours.lights_dn_per_s
 

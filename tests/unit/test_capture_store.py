@@ -329,7 +329,7 @@ def test_concurrent_reads_and_writes(store: CaptureStore) -> None:
         kept, read_counts = pool.map(keep, range(16)), pool.map(read, range(30))
         assert len(set(kept)) == 16
         assert max(read_counts) <= 16
-    assert sorted(one.id for one in store.captures()) == [f"{number:03}" for number in range(16)]
+    assert sorted(record.id for record in store.captures()) == [f"{number:03}" for number in range(16)]
 
 
 def test_an_opening_does_not_quarantine_a_capture_that_is_being_written(store: CaptureStore) -> None:
@@ -351,12 +351,12 @@ def test_an_opening_does_not_quarantine_a_capture_that_is_being_written(store: C
 
 def test_every_connection_is_durable_and_the_tables_are_strict(store: CaptureStore) -> None:
     engine = schema.open_engine(store.folder / "store.sqlite")
-    with engine.connect() as one, engine.connect() as two:
-        for connection in (one, two):
+    with engine.connect() as first, engine.connect() as second:
+        for connection in (first, second):
             for pragma, value in {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}.items():
                 assert connection.exec_driver_sql(f"PRAGMA {pragma}").scalar() == value
             assert connection.exec_driver_sql("PRAGMA busy_timeout").scalar() >= 1000
-        strict = {name: flag for name, flag in one.exec_driver_sql("SELECT name, strict FROM pragma_table_list")}  # noqa: C416
+        strict = {name: flag for name, flag in first.exec_driver_sql("SELECT name, strict FROM pragma_table_list")}  # noqa: C416
     engine.dispose()
     assert {strict[table.name] for table in schema.Base.metadata.sorted_tables} == {1}
 

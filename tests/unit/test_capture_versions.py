@@ -63,7 +63,7 @@ def test_a_version_stands_beside_the_picture_as_taken(store: CaptureStore) -> No
     assert store.read(ID, "report.json") == b"{}"
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.get(ID) == kept
-    assert all(one.is_whole for one in check_store(store.folder, lambda _: None) if "ledger" not in one.name)
+    assert all(result.is_whole for result in check_store(store.folder, lambda _: None) if "ledger" not in result.name)
 
 
 def test_a_result_is_adopted_once(store: CaptureStore) -> None:
@@ -117,7 +117,7 @@ def test_pictures_of_versions_are_removed_with_the_large_files_and_come_back(sto
 
 
 def test_a_backup_holds_the_versions_and_notices_a_new_one(store: CaptureStore) -> None:
-    (unit,) = [one for one in store_contents.units(store.folder) if one.startswith("captures")]
+    (unit,) = [name for name in store_contents.units(store.folder) if name.startswith("captures")]
     before = store_contents.fingerprint(store.folder, unit)
     store.versions.adopt(version(store), NOON)
     assert store_contents.fingerprint(store.folder, unit) != before
@@ -128,8 +128,8 @@ def test_a_backup_holds_the_versions_and_notices_a_new_one(store: CaptureStore) 
 def test_a_version_of_a_later_release_is_read_and_written_unchanged() -> None:
     stored = '{"versions": [{"number": 1, "result": "r", "at": null, "method": 3, "software": "9", "new": [1]}]}'
     report = CaptureReport.parse(stored)
-    (one,) = report.versions
-    assert (one.number, one.result, one.method) == (1, "r", None)
+    (entry,) = report.versions
+    assert (entry.number, entry.result, entry.method) == (1, "r", None)
     assert CaptureReport.parse(report_text(report)) == report
     assert '"method": 3' in report_text(report)
     assert CaptureReport.parse('{"versions": 3}').versions == ()

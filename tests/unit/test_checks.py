@@ -105,7 +105,9 @@ def test_a_large_number_of_visits_is_not_shown() -> None:
 
 def test_few_free_files_have_their_own_remedy() -> None:
     """Gigabytes may be free: "make room" would not help who looks at bytes."""
-    checks = [one for lacks in (False, True) for one in run_checks(replace(HEALTHY, people_left=9, lacks_files=lacks))]
+    checks = [
+        check for lacks in (False, True) for check in run_checks(replace(HEALTHY, people_left=9, lacks_files=lacks))
+    ]
     by_bytes, by_files = (check for check in checks if check.name == "space")
     assert "files" in by_files.value
     assert "files" in by_files.remedy

@@ -45,12 +45,12 @@ def test_lists_are_in_the_order_of_storage(
         captures.append(f"c{number}")
         store.save(Capture(captures[-1], "OD", clock.wall(), True, "00ff", CaptureReport(), {}), FILES)
         people.finish(next(keys), visits[-1])
-    assert [one.id for one in people.visits(2)] == visits[:0:-1], "the newest two"
-    assert [one.id for one in store.captures(2)] == captures[:0:-1]
-    assert {one.visit for one in UploadQueue(store.engine, clock).queued()} == set(visits)
+    assert [visit.id for visit in people.visits(2)] == visits[:0:-1], "the newest two"
+    assert [capture.id for capture in store.captures(2)] == captures[:0:-1]
+    assert {entry.visit for entry in UploadQueue(store.engine, clock).queued()} == set(visits)
     store.close()
     with CaptureStore(store.folder, reserve_bytes=0, clock=clock) as again:
-        assert [one.id for one in again.captures()] == captures[::-1]
+        assert [capture.id for capture in again.captures()] == captures[::-1]
 
 
 @pytest.mark.parametrize("jumps", JUMPS)

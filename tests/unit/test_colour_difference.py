@@ -14,11 +14,11 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize(("one", "other", "difference"), PAIRS)
+@pytest.mark.parametrize(("left", "right", "difference"), PAIRS)
 def test_published_pairs_are_met(
-    one: tuple[float, float, float], other: tuple[float, float, float], difference: float
+    left: tuple[float, float, float], right: tuple[float, float, float], difference: float
 ) -> None:
-    first, second = np.array([one]), np.array([other])
+    first, second = np.array([left]), np.array([right])
     assert ciede2000(first, second)[0] == pytest.approx(difference, abs=1e-4)  # the table's digits
     assert ciede2000(second, first)[0] == pytest.approx(difference, abs=1e-4)
 

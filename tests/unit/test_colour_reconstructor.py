@@ -84,8 +84,8 @@ def test_the_picture_has_three_channels_on_the_grid_of_green(bench: Bench) -> No
     assert of_red[0, 0] > max(0.85, of_red[MOVED_PX] + 0.02)
 
 
-def correlation(one: Image, other: Image, inside: np.ndarray) -> float:
-    return float(np.corrcoef(one[inside], other[inside])[0, 1])
+def correlation(left: Image, right: Image, inside: np.ndarray) -> float:
+    return float(np.corrcoef(left[inside], right[inside])[0, 1])
 
 
 @pytest.mark.parametrize("budget_s", [0.001, 0.1, 60.0])
@@ -93,7 +93,7 @@ def test_no_budget_is_too_short_for_a_colour(bench: Bench, budget_s: float) -> N
     """Else some pictures of a visit would be in colour and others not."""
     made = bench.picture(deadline=Deadline.after(SystemClock(), budget_s))
     assert isinstance(made, ColourReconstruction)
-    assert [(one.name, one.reason) for one in made.report.channels][:2] == [("green", None), ("red", None)]
+    assert [(channel.name, channel.reason) for channel in made.report.channels][:2] == [("green", None), ("red", None)]
 
 
 def test_green_leaves_the_colours_their_time_and_has_half_of_it(bench: Bench) -> None:

@@ -69,7 +69,7 @@ def test_a_cached_kernel_is_loaded_without_the_compiler(tmp_path: Path) -> None:
     words = [sys.executable, "-c", CACHED, str(tmp_path)]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     done = [subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True) for _ in range(2)]
-    assert [one.stdout for one in done] == ["6.0 True\n", "6.0 False\n"], done[1].stderr
+    assert [process.stdout for process in done] == ["6.0 True\n", "6.0 False\n"], done[1].stderr
 
 
 @pytest.mark.parametrize(("kind", "side"), [("a file", 30), ("a folder", 34), ("no text", 38)])

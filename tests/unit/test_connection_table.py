@@ -34,13 +34,13 @@ class FakeConnection:
 
 def table_of(*connections: FakeConnection, local: int = 3, remote: int = 3, per_address: int = 2) -> ConnectionTable:
     table = ConnectionTable(ConnectionLimits(ClientLimits(local, remote, per_address)), VirtualClock())
-    for one in connections:
-        table.add(one)
+    for connection in connections:
+        table.add(connection)
     return table
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "is_same", "is_local"),
+    ("left", "right", "is_same", "is_local"),
     [
         ("127.0.0.1", "127.0.0.1", True, True),
         ("::1", "::1", True, True),
@@ -54,9 +54,9 @@ def table_of(*connections: FakeConnection, local: int = 3, remote: int = 3, per_
     ],
 )
 def test_a_client_is_an_ipv4_address_or_an_ipv6_network_of_64_bits(
-    one: str, other: str, is_same: bool, is_local: bool
+    left: str, right: str, is_same: bool, is_local: bool
 ) -> None:
-    assert (Client.at(one) == Client.at(other), Client.at(one).is_local) == (is_same, is_local)
+    assert (Client.at(left) == Client.at(right), Client.at(left).is_local) == (is_same, is_local)
 
 
 def test_remote_clients_and_one_address_have_limits_of_their_own() -> None:
@@ -82,18 +82,18 @@ def test_the_connection_that_waited_longest_is_dropped_for_a_new_one() -> None:
     table.set_waiting(first, False)  # a request, which is answered
     table.set_waiting(first, True)
     table.add(new)
-    assert [one.is_dropped for one in (first, second, third, new)] == [False, True, False, False]
+    assert [connection.is_dropped for connection in (first, second, third, new)] == [False, True, False, False]
     assert len(table) == 3
 
 
 def test_a_connection_that_is_answered_is_never_dropped_for_a_new_one() -> None:
     sending, asking, other = FakeConnection(SCREEN, has_unsent_bytes=True), *(FakeConnection(SCREEN) for _ in range(2))
     table = table_of(sending, asking, other)
-    for one in (asking, other):
-        table.set_waiting(one, False)
+    for connection in (asking, other):
+        table.set_waiting(connection, False)
     new, later = FakeConnection(SCREEN), FakeConnection(SCREEN)
     table.add(new)
-    assert [one.is_dropped for one in (sending, asking, other, new)] == [False, False, False, True]
+    assert [connection.is_dropped for connection in (sending, asking, other, new)] == [False, False, False, True]
     table.remove(asking)
     table.add(later)
     assert not later.is_dropped
@@ -103,7 +103,14 @@ def test_an_address_at_its_limit_gets_no_place_of_another_one() -> None:
     screen, tablet = FakeConnection(SCREEN), FakeConnection(TABLET)
     phone = [FakeConnection(PHONE) for _ in range(4)]
     table = table_of(screen, tablet, *phone)
-    assert [one.is_dropped for one in (screen, tablet, *phone)] == [False, False, False, False, True, True]
+    assert [connection.is_dropped for connection in (screen, tablet, *phone)] == [
+        False,
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
     assert [table.is_refused(client) for client in (SCREEN, TABLET, PHONE)] == [False, False, True]
 
 
@@ -111,8 +118,8 @@ def test_remote_connections_never_take_the_place_of_a_local_one() -> None:
     screen = [FakeConnection(SCREEN) for _ in range(3)]
     strangers = [FakeConnection(Client.at(f"10.42.0.{k}")) for k in range(9)]
     table = table_of(*screen, *strangers)
-    assert not any(one.is_dropped for one in screen)
-    assert sum(one.is_dropped for one in strangers) == 6
+    assert not any(connection.is_dropped for connection in screen)
+    assert sum(connection.is_dropped for connection in strangers) == 6
     assert len(table) == 6
 
 

@@ -105,7 +105,7 @@ def corrupt(folder: Path, table: str, column: str, random_source: random.Random)
         rowid, content = random_source.choice(rows)
         at = random_source.randrange(len(content))
         corrupted = bytearray(content)
-        corrupted[at] = random_source.choice([one for one in range(1, 256) if one != content[at]])
+        corrupted[at] = random_source.choice([byte for byte in range(1, 256) if byte != content[at]])
         if len(content) < DISTINCT or random_source.random() < 0.5:
             change = f"UPDATE OR IGNORE {table} SET {column} = CAST(? AS TEXT) WHERE rowid = ?"
             tables.execute(change, (bytes(corrupted), rowid))
@@ -136,7 +136,7 @@ def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
     if change_made.startswith(
         "row"
     ):  # after damage to an index alone, lists follow the index and counts follow the row
-        assert {one.id for one in captures} >= {"c0", "c1", "c2"}, f"{change_made}: not healed"
+        assert {capture.id for capture in captures} >= {"c0", "c1", "c2"}, f"{change_made}: not healed"
         assert store.damaged() <= 1, change_made  # a row whose id changed stays, and its capture is adopted again
         assert len(visits) + people.damaged() == 3, change_made
     written = (
@@ -178,8 +178,8 @@ def store(filled: Path, tmp_path: Path) -> Iterator[CaptureStore]:
 def test_a_damaged_capture_is_refused_and_counted_and_its_files_stay_readable(store: CaptureStore) -> None:
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE captures SET report = replace(report, ':', ';') WHERE id = 'c1'")
-    assert [one.id for one in store.captures()] == ["c2", "c0"]
-    assert [one.id for one in store.captures(1, before="c2")] == ["c0"]
+    assert [capture.id for capture in store.captures()] == ["c2", "c0"]
+    assert [capture.id for capture in store.captures(1, before="c2")] == ["c0"]
     assert store.damaged() == 1
     with pytest.raises(StoreDamaged, match="entry of 'c1' cannot be read") as raised:
         store.get("c1")
@@ -201,7 +201,8 @@ def test_a_damaged_visit_is_refused_and_counted(store: CaptureStore) -> None:
         with pytest.raises(StoreDamaged, match="cannot be read"):
             people.get(visit.id)
     queue = UploadQueue(store.engine, VirtualClock())
-    assert [one.visit for one in queue.queued()] == [middle.id, newest.id]  # building its archive reports the damage
+    # building its archive reports the damage
+    assert [entry.visit for entry in queue.queued()] == [middle.id, newest.id]
 
 
 def test_an_unreadable_finish_does_not_block_the_queue(store: CaptureStore) -> None:
@@ -209,13 +210,13 @@ def test_an_unreadable_finish_does_not_block_the_queue(store: CaptureStore) -> N
     first, second = queue.queued()
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE visits SET finished_at = replace(finished_at, '-', '+') WHERE id = ?", (first.visit,))
-    assert [one.visit for one in queue.queued(1)] == [second.visit]
+    assert [entry.visit for entry in queue.queued(1)] == [second.visit]
 
 
 def test_a_timestamp_without_a_time_zone_is_damaged(store: CaptureStore) -> None:
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE captures SET taken_at = '2026-03-01T12:00:00' WHERE id = 'c0'")
-    assert datetime.now(UTC) > min(one.taken_at for one in store.captures())
+    assert datetime.now(UTC) > min(capture.taken_at for capture in store.captures())
     assert store.damaged() == 1
 
 
@@ -224,5 +225,5 @@ def test_a_report_that_cannot_be_written_as_json_again_is_damaged(store: Capture
     report = value if value.startswith(("{", "[")) else f'{{"noise_dn": {value}}}'
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE captures SET report = ? WHERE id = 'c1'", (report,))
-    assert [one.id for one in store.captures()] == ["c2", "c0"]
+    assert [capture.id for capture in store.captures()] == ["c2", "c0"]
     assert store.damaged() == 1

@@ -56,8 +56,8 @@ def grey(pair: Pair) -> np.ndarray:
     return np.atleast_3d(pair.raw.pixels).mean(axis=2)
 
 
-def pcc(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+def pcc(left: np.ndarray, right: np.ndarray) -> float:
+    return float(np.corrcoef(left.ravel(), right.ravel())[0, 1])
 
 
 def test_channels_are_red_green_blue(scene: Scene, tmp_path: Path) -> None:

@@ -85,15 +85,15 @@ def test_numbers_of_two_devices_are_disjoint(tmp_path: Path) -> None:
         protocol = load_protocol().for_device(load_or_create_device(tmp_path / name, NO_BOARD).prefix)
         prefix = protocol.programme.prefix
         numbers.append({automatic_number(prefix, count) for count in range(1, DRAWS + 1)})
-    assert [len(one) for one in numbers] == [DRAWS, DRAWS]
+    assert [len(series) for series in numbers] == [DRAWS, DRAWS]
     assert not numbers[0] & numbers[1]
 
 
 def test_a_programme_may_leave_the_letters_of_the_device_out() -> None:
     protocol = load_protocol()
     programme = protocol.programme.model_copy(update={"device_in_number": False})
-    one = protocol.model_copy(update={"programme": programme})
-    assert one.for_device("KFTRW").programme.prefix == "A"
+    changed = protocol.model_copy(update={"programme": programme})
+    assert changed.for_device("KFTRW").programme.prefix == "A"
     assert protocol.for_device("KFTRW").programme.prefix == "AKFTRW"
 
 

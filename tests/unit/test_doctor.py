@@ -35,7 +35,7 @@ def machine(tmp_path: Path) -> Machine:
 
 
 def remedies(machine: Machine) -> dict[str, str]:
-    return {one.check: one.remedy for one in buses(machine, load_head(POWER))}
+    return {finding.check: finding.remedy for finding in buses(machine, load_head(POWER))}
 
 
 def test_a_bus_that_is_off_is_switched_on_by_its_own_line(machine: Machine) -> None:
@@ -60,7 +60,7 @@ def test_another_node_than_the_head_files_is_named(machine: Machine) -> None:
 def test_present_buses_are_well_and_each_kind_names_its_group(machine: Machine) -> None:
     for name in ("spidev0.0", "i2c-1", "gpiochip0"):
         (machine.root / "dev" / name).touch()
-    assert {one.state for one in buses(machine, load_head(POWER))} == {"ok"}
+    assert {finding.state for finding in buses(machine, load_head(POWER))} == {"ok"}
     for kind in (SPI, I2C, GPIO):
         assert f"usermod -aG {kind.group} " in (kind.remedy("/dev/x", errno.EACCES) or "")
         assert "Another program" in (kind.remedy("/dev/x", errno.EBUSY) or "")
@@ -100,7 +100,7 @@ def test_every_failure_has_a_remedy(machine: Machine, head: Path) -> None:
     if spec.camera.backend == "sim":
         pytest.skip("nothing of it is connected")
     report = examine(machine, spec)
-    assert [one.check for one in report.findings if one.state == "failed" and not one.remedy] == []
+    assert [finding.check for finding in report.findings if finding.state == "failed" and not finding.remedy] == []
     assert DoctorReport.model_validate_json(report.model_dump_json()) == report
     assert len(table(report).splitlines()) >= len(report.findings)
 

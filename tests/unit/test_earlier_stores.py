@@ -75,7 +75,7 @@ def earlier(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def content(folder: Path) -> dict[str, tuple[int, bytes]]:
     """Return time of change and content of everything in a folder, by path; folders have no content."""
     every = [folder, *sorted(folder.rglob("*"))]
-    return {str(one): (one.stat().st_mtime_ns, one.read_bytes() if one.is_file() else b"") for one in every}
+    return {str(path): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else b"") for path in every}
 
 
 def opened(folder: Path, _: Path) -> None:
@@ -139,7 +139,7 @@ def test_an_earlier_snapshot_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=f"the snapshot r0006.db {MESSAGE}"):
         Snapshots(tmp_path / schema.DATABASE, SystemClock()).restore("r0006.db")
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        assert [one.id for one in store.captures()] == ["a"]
+        assert [capture.id for capture in store.captures()] == ["a"]
 
 
 @pytest.mark.parametrize("name", ["shelf.sqlite", schema.DATABASE])
@@ -175,4 +175,4 @@ def test_tables_whose_definition_is_damaged_are_rebuilt(tmp_path: Path) -> None:
     database.write_bytes(database.read_bytes().replace(definition, definition.replace(b"TABLE", b"TABL\xf3")))
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         assert store.recovery.rebuilt_because is not None
-        assert [one.id for one in store.captures()] == ["a"]
+        assert [capture.id for capture in store.captures()] == ["a"]

@@ -129,7 +129,7 @@ def dot(spec: InstrumentSpec, *names: str, at_px: tuple[int, int] = (0, 0)) -> t
     here = scene(spec)
     plane = np.zeros((133, 133), np.float32)
     plane[66 + at_px[1], 66 + at_px[0]] = 1
-    chosen = [one for one in decide(here, only=names) if one.simulated]
+    chosen = [decision for decision in decide(here, only=names) if decision.simulated]
     setup = build_setup(here, Fundus(dict.fromkeys(("red", "green", "blue"), plane), plane > 0), chosen)
     return setup, electrons_per_s(setup).astype(np.float64)
 
@@ -576,17 +576,22 @@ def test_an_unknown_effect_is_refused_with_the_closest_name(chosen: str) -> None
 
 def test_plan_follows_threshold_and_options() -> None:
     here = scene(with_keys(PLAIN, eye={"m_dpt": 0.005}, light={"stray": 0.1}))
-    planned = {one.name: one for one in decide(here)}
+    planned = {decision.name: decision for decision in decide(here)}
     assert 0 < planned["refraction"].eta < 0.05
     assert not planned["refraction"].simulated
     assert planned["stray"].simulated
-    assert all(one.simulated for one in decide(here, everything=True))
-    assert [one.name for one in decide(here, only=["stray", "leds"]) if one.simulated] == ["leds", "stray"]
-    assert not {one.name: one for one in decide(here, everything=True, without=["stray"])}["stray"].simulated
+    assert all(decision.simulated for decision in decide(here, everything=True))
+    assert [decision.name for decision in decide(here, only=["stray", "leds"]) if decision.simulated] == [
+        "leds",
+        "stray",
+    ]
+    assert not {decision.name: decision for decision in decide(here, everything=True, without=["stray"])}[
+        "stray"
+    ].simulated
     with pytest.raises(SettingError, match="cannot both be selected"):
         decide(here, everything=True, only=["stray"])
-    assert [one.name for one in decide(here)] == [effect.name for effect in EFFECTS]
-    assert all(isinstance(one, Decision) for one in decide(here))
+    assert [decision.name for decision in decide(here)] == [effect.name for effect in EFFECTS]
+    assert all(isinstance(decision, Decision) for decision in decide(here))
 
 
 def test_the_documents_show_the_plan_as_the_command_prints_it() -> None:

@@ -71,5 +71,5 @@ def test_the_first_readme_shows_every_transition_of_a_press() -> None:
         for before, after in re.findall(r"([A-Z_]+) -> ([A-Z_]+)", arrows):
             drawn |= {(before, event, after) for event in events.split(" or ")}
     table = {(before.name, event.name, after.name) for (before, event), after in TRANSITIONS.items()}
-    assert drawn == {one for one in table if one[1] != "END"}
+    assert drawn == {row for row in table if row[1] != "END"}
     assert "on END: every state -> ENDED" in drawing

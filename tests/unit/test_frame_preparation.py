@@ -58,10 +58,10 @@ def frame(number: int, colour: Colour | None = "green") -> Frame:
 def test_lit_frames_of_the_burst_are_prepared_with_the_dark_frame_in_a_thread() -> None:
     bench = Bench()
     with bench.preparation() as preparation:
-        for one in (frame(9, None), frame(1), frame(2), frame(3, "red")):
-            preparation.add(one)
+        for taken in (frame(9, None), frame(1), frame(2), frame(3, "red")):
+            preparation.add(taken)
         ready = preparation.finish()
-    assert {number: one.verdict.numbers["number"] for number, one in ready.items()} == {1: 1, 2: 2}
+    assert {number: prepared.verdict.numbers["number"] for number, prepared in ready.items()} == {1: 1, 2: 2}
     assert bench.darks == {9.0}
     ((look, simulated, thread),) = bench.looks
     assert (look, simulated, bench.refracted) == (1, True, [1]), "the first one alone"

@@ -41,7 +41,7 @@ def write(folder: Path, taken: list[Frame]) -> FrameWriter:
 
 
 def names(stored: tuple[StoredFrame, ...]) -> list[str]:
-    return [one.file.path.name for one in stored]
+    return [frame.file.path.name for frame in stored]
 
 
 def test_frames_are_read_as_they_were_taken_with_dose_light_and_number(tmp_path: Path) -> None:
@@ -50,12 +50,12 @@ def test_frames_are_read_as_they_were_taken_with_dose_light_and_number(tmp_path:
     files = writer.finish()
     stored = stored_frames(tmp_path / "press")
     assert names(stored) == NAMES
-    assert [one.is_lit for one in stored] == [True, True, False, False]
-    assert {one.number: one.file for one in stored} == files
-    assert [one.dose_j_per_cm2 for one in stored] == pytest.approx([1e-5, 2e-5, 3e-5, 4e-5])
+    assert [stored_frame.is_lit for stored_frame in stored] == [True, True, False, False]
+    assert {stored_frame.number: stored_frame.file for stored_frame in stored} == files
+    assert [stored_frame.dose_j_per_cm2 for stored_frame in stored] == pytest.approx([1e-5, 2e-5, 3e-5, 4e-5])
     assert stored[-1].exposed_s == pytest.approx(0.4)
-    for one, before in zip(stored, taken, strict=True):
-        frame, metadata = one.load()
+    for stored_frame, before in zip(stored, taken, strict=True):
+        frame, metadata = stored_frame.load()
         assert np.array_equal(frame.counts, before.counts)
         assert (frame.exposure_s, frame.number, frame.illumination, frame.simulated) == (
             before.exposure_s,

@@ -143,7 +143,7 @@ def test_every_thumbnail_has_its_letter_at_a_mark():
     found = measured(rng)
     panel = thumbnails(rng, found)
     drawing = draw_frontier(found, thumbnails=panel)
-    images = [one for one in panel.elements if one.startswith("<image")]
+    images = [element for element in panel.elements if element.startswith("<image")]
     assert sorted(letters(drawing)) == list("ABCD")[: len(images) - 1]
     picture = Pictures.open(BytesIO(b64decode(images[0].split("base64,")[1].split('"')[0])))
     assert picture.size == (SIDE_PX, SIDE_PX)
@@ -169,10 +169,10 @@ def test_a_spot_counts_as_visible_with_its_contrast_and_over_the_error():
     truth = np.ones((140, 140))
     truth[20:25, 20:25] = truth[60:65, 60:65] = truth[100:105, 100:105] = 0
     faint, inverted = 1 - 0.3 * (1 - truth), 2 - truth
-    one = truth.copy()
-    one[20:25, 20:25] = 1
+    partial = truth.copy()
+    partial[20:25, 20:25] = 1
     noisy = truth + np.random.default_rng(6).normal(0, 4, truth.shape)
-    counts, spots = visible_spots([truth, one, faint, inverted, noisy], truth)
+    counts, spots = visible_spots([truth, partial, faint, inverted, noisy], truth)
     assert spots == 3
     assert counts[:4] == [3, 2, 0, 0]
     assert counts[4] < 3

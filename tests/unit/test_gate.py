@@ -64,10 +64,10 @@ def test_every_pin_is_drawn_as_documented() -> None:
 def test_every_swap_of_two_pins_of_a_component_is_found() -> None:
     drawn, tried = netlist(), 0
     for ref in drawn.parts:
-        for one, other in itertools.combinations(drawn.pins(ref), 2):
-            if drawn.nets[one] != drawn.nets[other]:
+        for left, right in itertools.combinations(drawn.pins(ref), 2):
+            if drawn.nets[left] != drawn.nets[right]:
                 tried += 1
-                assert differences(drawn.swapped(one, other)), f"{one} and {other} swapped"
+                assert differences(drawn.swapped(left, right)), f"{left} and {right} swapped"
     assert tried > 300
 
 
@@ -123,13 +123,13 @@ def test_failures_that_do_not_leave_the_leds_dark_are_those_of_the_document() ->
     assert listed == {name: light for name, light in found.items() if light != "dark"}
     numbers = re.search(r"for ever: (\d+) failures.*?(\d+) leave the LEDs dark", words, re.S)
     assert numbers is not None
-    assert [int(one) for one in numbers.groups()] == [len(found), len(found) - len(listed)]
+    assert [int(number) for number in numbers.groups()] == [len(found), len(found) - len(listed)]
 
 
-def ohms(drawn: Netlist, one: str, other: str) -> list[str]:
+def ohms(drawn: Netlist, left: str, right: str) -> list[str]:
     """Return the values of the resistors between two nets."""
     ends = {ref: {drawn.nets[ref, "1"], drawn.nets[ref, "2"]} for ref in drawn.values if ref[0] == "R"}
-    return [drawn.values[ref] for ref, nets in ends.items() if nets == {one, other}]
+    return [drawn.values[ref] for ref, nets in ends.items() if nets == {left, right}]
 
 
 def reached(drawn: Netlist, net: str) -> set[str | None]:
@@ -154,20 +154,20 @@ def test_resistances_of_the_check_before_the_computer_are_those_of_the_schematic
     rows = re.findall(r"^\| (J\d) (\d+) and (\d+) \| (\S+), (\S+) \| ([^|,]+)", text("hardware/assembly.md"), re.M)
     assert len(rows) == 5
     pads, drawn = read_board("gate").pads, netlist()
-    for plug, one, other, first, second, shown in rows:
-        assert (pads[plug, one].net, pads[plug, other].net) == (first, second)
+    for plug, left, right, first, second, shown in rows:
+        assert (pads[plug, left].net, pads[plug, right].net) == (first, second)
         if shown.startswith("above"):
             assert second not in reached(drawn, first), f"{first} to {second}"
         else:
             assert ohms(drawn, first, second) == [shown.replace(" ", "").strip()]
     along = sorted((pad.place_mm[1], pad.net) for (ref, _), pad in pads.items() if ref == "J1")
-    for (_, one), (_, other) in itertools.pairwise(along):
-        assert one is not None
-        assert other not in reached(drawn, one), "the other neighbours"
+    for (_, before), (_, after) in itertools.pairwise(along):
+        assert before is not None
+        assert after not in reached(drawn, before), "the other neighbours"
 
 
 def test_every_component_of_the_gate_fails_in_the_table() -> None:
-    names = [one.name for one in failures(netlist())]
+    names = [failure.name for failure in failures(netlist())]
     assert len(names) == len(set(names)) > 40
     assert all(any(f" {ref} " in f"{name} " for name in names) for ref in GATE)
 

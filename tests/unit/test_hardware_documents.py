@@ -369,7 +369,10 @@ def test_distances_of_glass_in_the_guide_are_those_of_the_ray_trace() -> None:
     last_mm, along = traced.iris_at_mm - faces[-1].at_mm, path.optics.angular_magnification**2
 
     def rims_mm(left: Surface, right: Surface) -> float:
-        sags = [abs(one.radius_mm) - (one.radius_mm**2 - (path.relay.lens_mm / 2) ** 2) ** 0.5 for one in (left, right)]
+        sags = [
+            abs(surface.radius_mm) - (surface.radius_mm**2 - (path.relay.lens_mm / 2) ** 2) ** 0.5
+            for surface in (left, right)
+        ]
         return right.at_mm - left.at_mm + sum(sags)
 
     figures = [

@@ -57,25 +57,25 @@ def assessment(frame: Counts, darkness: Counts | None = None, at: int = 0) -> Ca
 
 
 def found(*sights: CaptureAssessment) -> dict[str, Finding]:
-    return {one.name: one for one in head_check.check(calibrated(), KNOWN, sights, (), NOW)}
+    return {finding.name: finding for finding in head_check.check(calibrated(), KNOWN, sights, (), NOW)}
 
 
 def of_darks(make: Callable[[int], Counts]) -> dict[str, Finding]:
     nothing = np.empty((0, 0), np.uint16)
     darks = (ExposurePair(NOW + timedelta(minutes=n), nothing, make(n), 0.1) for n in range(3))
-    return found(*(assess_capture(calibrated(), KNOWN, None, one) for one in darks))
+    return found(*(assess_capture(calibrated(), KNOWN, None, pair) for pair in darks))
 
 
 @pytest.mark.parametrize(("retina", "m_dpt"), list(product(RETINAS, SPHERES_DPT)))
 def test_a_good_head_passes_with_any_eye(retina: int, m_dpt: float, record_property: Callable[..., None]) -> None:
     """In 210 frames (`python -m tests.bench fitness`) there is no false alarm; the scores are 0.84 to 1.24."""
     seen = [assessment(frame_through(caustic_of_eye(m_dpt), retina, light)) for light in LIGHTS]
-    scores = [one.statement.score for one in seen if one.statement is not None]
+    scores = [sight.statement.score for sight in seen if sight.statement is not None]
     record_property("scores", scores)
     assert 0.8 < min(scores) < max(scores) < 1.3
     findings = found(*seen)
     assert set(findings) == {"age", "psf", "shift", "width", "hot pixels", "black level", "dark noise"}
-    assert all(one.ok and not one.remedy for one in findings.values())
+    assert all(finding.ok and not finding.remedy for finding in findings.values())
     assert seen[0].statement is not None
     assert seen[0].statement.m_dpt == pytest.approx(m_dpt, abs=0.4)
 
@@ -105,11 +105,12 @@ def test_no_scene_with_a_retina_fails_the_checks(name: str, record_property: Cal
     psf_check = PsfMatchTest(RefractionEstimator(calibration, world.shape, PLANNER, 0), has_sharp_edge(spec))
     seen = ExposurePair(NOW, exposed_counts(world), exposed_counts(world, lit=False), spec.camera.exposure_s)
     findings = head_check.check(calibration, None, [assess_capture(calibration, None, psf_check, seen)], (), NOW)
-    record_property("findings", [(one.name, one.value) for one in findings])
-    assert {one.name for one in findings if not one.ok} <= {"black level"}  # with room light, or a warm sensor
-    assert not any(one.fails for one in findings)
-    assert ({"shift", "width"} <= {one.name for one in findings}) is has_sharp_edge(spec)
-    assert next(one.value for one in findings if one.name == "psf") > 0.7
+    record_property("findings", [(finding.name, finding.value) for finding in findings])
+    # with room light, or a warm sensor
+    assert {finding.name for finding in findings if not finding.ok} <= {"black level"}
+    assert not any(finding.fails for finding in findings)
+    assert ({"shift", "width"} <= {finding.name for finding in findings}) is has_sharp_edge(spec)
+    assert next(finding.value for finding in findings if finding.name == "psf") > 0.7
 
 
 @pytest.mark.parametrize("diffuser", [5, 6, 7])
@@ -155,7 +156,7 @@ def test_a_field_shift_is_measured_and_passes_the_psf_check(by_deg: float) -> No
 
 
 def test_one_bad_capture_is_a_hint_two_of_three_fail_and_good_ones_restore() -> None:
-    good, strange = (frame_through(one) for one in (caustic_of_eye(), caustic_of_eye(turned_deg=2)))
+    good, strange = (frame_through(caustic) for caustic in (caustic_of_eye(), caustic_of_eye(turned_deg=2)))
     first = [assessment(good, at=0), assessment(good, at=1), assessment(strange, at=2)]
     assert found(*first)["psf"].hint
     head_check.raise_on_failure(tuple(found(*first).values()))
@@ -226,7 +227,7 @@ def test_room_light_raises_hints_and_no_failure() -> None:
     assert findings["black level"].hint
     assert findings["dark noise"].hint
     assert findings["hot pixels"].value < 0.01
-    assert not any(one.fails for one in findings.values())
+    assert not any(finding.fails for finding in findings.values())
 
 
 # Scale over many patients
@@ -235,11 +236,11 @@ def test_room_light_raises_hints_and_no_failure() -> None:
 def test_the_scale_check_needs_many_patients() -> None:
     def scale(spheres_dpt: np.ndarray, minutes: int) -> Finding | None:
         refractions = [
-            ReportedRefraction(NOW + timedelta(minutes=minutes * n), float(one), 0.0, 0.0)
-            for n, one in enumerate(spheres_dpt)
+            ReportedRefraction(NOW + timedelta(minutes=minutes * n), float(sphere_dpt), 0.0, 0.0)
+            for n, sphere_dpt in enumerate(spheres_dpt)
         ]
         found = head_check.check(calibrated(), KNOWN, (), refractions, NOW)
-        return next((one for one in found if one.name == "scale"), None)
+        return next((finding for finding in found if finding.name == "scale"), None)
 
     spheres_dpt = np.random.default_rng(1).normal(-0.5, 2.5, 40)
     assert scale(spheres_dpt, 60).ok  # type: ignore[union-attr]
@@ -258,11 +259,11 @@ def edge(off_deg: float, sd_deg: float, eyes: int, minutes: int = 60) -> Finding
     assert field_deg is not None
     found_deg = field_deg + off_deg + np.random.default_rng(2).normal(0, 0.1, eyes)
     refractions = [
-        ReportedRefraction(NOW + timedelta(minutes=minutes * n), 0.0, float(one), sd_deg)
-        for n, one in enumerate(found_deg)
+        ReportedRefraction(NOW + timedelta(minutes=minutes * n), 0.0, float(edge_deg), sd_deg)
+        for n, edge_deg in enumerate(found_deg)
     ]
     findings = head_check.check(calibrated(), KNOWN, (), refractions, NOW)
-    return next((one for one in findings if one.name == "edge"), None)
+    return next((finding for finding in findings if finding.name == "edge"), None)
 
 
 @pytest.mark.parametrize("off_deg", [-1.0, 1.0])

@@ -66,7 +66,7 @@ def test_measured_irradiance_replaces_the_estimate_and_is_named(tmp_path: Path) 
     measured = SIM.model_copy(update={"light": SIM.light.model_copy(update={"radiometry": table})})
     assert light(measured) == pytest.approx(3 * light(SIM))
     plan = simulate(coarse(measured, 8), tmp_path / "scene").plan
-    assert any("2026-11-02, PM100D" in one.why for one in plan)
+    assert any("2026-11-02, PM100D" in decision.why for decision in plan)
     assert '"why": ' in (text := (tmp_path / "scene" / "plan.json").read_text())
     assert "the budget's mean is" in text
 

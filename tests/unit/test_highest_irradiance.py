@@ -60,7 +60,7 @@ class DrawnHeads:
     def highest_mw_per_cm2(self) -> Floats:
         """Return the highest irradiance of any place of a flat retina within 6 degrees of each axis, (heads,)."""
         steps = np.radians(np.linspace(-6, 6, 5))
-        right, up = (one.reshape(1, 1, -1) for one in np.meshgrid(steps, steps))
+        right, up = (grid.reshape(1, 1, -1) for grid in np.meshgrid(steps, steps))
         falls = np.cos(np.hypot(right, up)[:, 0]) ** 3
         return np.asarray((self.intensity_mw_per_sr(right, up).sum(axis=1) * falls).max(axis=1) / EYE_CM**2)
 

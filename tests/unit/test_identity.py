@@ -52,11 +52,11 @@ def test_identity_is_created_once_and_then_read(tmp_path: Path) -> None:
 
 
 def test_two_devices_share_no_secret(tmp_path: Path) -> None:
-    one, other = (load_or_create_identity(tmp_path / name, SERIAL, VirtualClock()) for name in ("one", "other"))
-    assert one.wifi != other.wifi
-    assert one.machine_id != other.machine_id
-    assert one.authority_key != other.authority_key
-    assert re.fullmatch(r"([a-hjkmnp-z2-9]{4}-){3}[a-hjkmnp-z2-9]{4}", one.wifi)
+    left, right = (load_or_create_identity(tmp_path / name, SERIAL, VirtualClock()) for name in ("one", "other"))
+    assert left.wifi != right.wifi
+    assert left.machine_id != right.machine_id
+    assert left.authority_key != right.authority_key
+    assert re.fullmatch(r"([a-hjkmnp-z2-9]{4}-){3}[a-hjkmnp-z2-9]{4}", left.wifi)
 
 
 def test_interrupted_first_boot_is_completed_by_the_next(tmp_path: Path) -> None:

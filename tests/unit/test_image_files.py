@@ -293,7 +293,7 @@ def test_pattern_of_a_dng_follows_its_areas_and_its_orientation(
         read = read_image_file(tmp_path / "a.dng")
         (pixels,) = read.frames
         assert pixels.shape == (size if orientation < 5 else size[::-1])
-        assert read.levels.bayer == "".join("rgb"[int(one)] for one in pixels[:2, :2].ravel())
+        assert read.levels.bayer == "".join("rgb"[int(colour)] for colour in pixels[:2, :2].ravel())
 
 
 def test_levels_of_a_dng_are_those_of_the_counts_after_their_shift(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_drawn_retinas_get_no_wrong_eye_when_rotated_diseased_or_noisy() -> None
                 seen = field_of_view(whole, 0.0, turned_deg)
                 noise = np.random.default_rng(seed).standard_normal(seen.shape, np.float32)
                 results.append((estimated(seen * (1 + np.float32(0.1) * noise)).eye, eye))
-    assert not [one for one in results if one[0] == OTHER[one[1]]]
+    assert not [result for result in results if result[0] == OTHER[result[1]]]
     assert sum(found == eye for found, eye in results) >= 0.6 * len(results)
 
 

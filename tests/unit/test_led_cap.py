@@ -72,11 +72,13 @@ def test_document_has_the_edge_and_the_tolerances_of_the_command() -> None:
     limits, optics = light_limits(), text("device/optics/OPTICS.md")
     used = limit_shares(POWER, expected_beam(POWER), limits)[0].used
     found = tolerances(POWER, used, limits)
-    for one in found:
-        half, centre = ((f"{low:.{n}f}", f"{high:.{n}f}") for (low, high), n in ((one.half_deg, 1), (one.centre, 2)))
+    for tolerance in found:
+        half, centre = (
+            (f"{low:.{n}f}", f"{high:.{n}f}") for (low, high), n in ((tolerance.half_deg, 1), (tolerance.centre, 2))
+        )
         columns = (" to ".join(dict.fromkeys(ends)) for ends in (half, centre))
-        size = one.size.replace("%", " %")
-        row = f"| {one.name} | {size} | {100 * one.used:.0f} % | {' | '.join(columns)} |"
+        size = tolerance.size.replace("%", " %")
+        row = f"| {tolerance.name} | {size} | {100 * tolerance.used:.0f} % | {' | '.join(columns)} |"
         assert row.replace("|  |", "| |") in optics
     shares = [f"{share:.2g}" for share in relative_irradiance(CAP, RELAY, [0, 10, 14, 16.7, 20])]
     edge = [f"{half_maximum_deg(CAP, RELAY) / 2:.1f}", f"{dark_deg(CAP, RELAY) / 2:.1f}"]

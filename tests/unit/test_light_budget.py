@@ -131,26 +131,30 @@ def test_the_chosen_head_has_enough_light_within_every_limit() -> None:
     ring = sinks("imx296_power")
     assert ring.most_ma <= head_search.SUPPLY_MA
     drawn_ma = ring.output_ma * len(ring.colours["green"].outputs[0])
-    powers = [one.led.power_mw for one in head_search.CHOICES if (one.colour, one.current_ma) == ("green", drawn_ma)]
+    powers = [
+        choice.led.power_mw
+        for choice in head_search.CHOICES
+        if (choice.colour, choice.current_ma) == ("green", drawn_ma)
+    ]
     assert powers == [ring.colours["green"].power_mw], "the search takes the head's LED at its current"
 
 
 def test_the_search_exceeds_no_limit_and_ranks_enough_light_first() -> None:
     found = head_search.search(design("imx296"))
-    assert max(one.largest_share for one in found) <= 1
-    enough = [one.light_e >= ENOUGH_E for one in found]
+    assert max(candidate.largest_share for candidate in found) <= 1
+    enough = [candidate.light_e >= ENOUGH_E for candidate in found]
     assert any(enough)
     assert enough == sorted(enough, reverse=True)
-    assert all(one.leds * one.choice.current_ma <= head_search.SUPPLY_MA for one in found)
+    assert all(candidate.leds * candidate.choice.current_ma <= head_search.SUPPLY_MA for candidate in found)
 
 
 def test_the_search_leaves_out_an_iris_whose_caustic_the_sensor_does_not_hold() -> None:
     """The calibration wants a sixteenth of the sensor's side dark at each edge: 3.28 mm of the IMX296's 3.75."""
     small = design("imx296")
     assert widest_iris_mm(small) == pytest.approx(14 / 16 * 1088 * 3.45e-3)
-    assert max(one.iris_um for one in head_search.search(small)) == 3200
+    assert max(candidate.iris_um for candidate in head_search.search(small)) == 3200
     large = replace(small, rows=1456)
-    assert max(one.iris_um for one in head_search.search(large)) == 4000
+    assert max(candidate.iris_um for candidate in head_search.search(large)) == 4000
 
 
 @pytest.mark.parametrize("name", ["imx296", "imx296_power"])
@@ -170,9 +174,9 @@ def test_a_wider_field_has_a_wider_cone_in_budget_and_hazard() -> None:
     assert spec.optics is not None
     wide = spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": 50.0})})
     times = (sin(radians(50 * 0.375)) / sin(radians(12.5))) ** 2
-    usual, more = (cornea_mw(chain(design_of_head(PATH, one))) for one in (spec, wide))
+    usual, more = (cornea_mw(chain(design_of_head(PATH, instrument))) for instrument in (spec, wide))
     assert more / usual == pytest.approx(times, rel=0.01)  # 12.5 degrees are 12.525, rounded by the paper
-    waists = [hazard_of(one).beams["green"].waist_w_per_cm2 for one in (spec, wide)]
+    waists = [hazard_of(instrument).beams["green"].waist_w_per_cm2 for instrument in (spec, wide)]
     assert waists[1] / waists[0] == pytest.approx(times, rel=0.01)
     narrow = spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": 20.0})})
     assert hazard_of(narrow).beams["green"].waist_w_per_cm2 == waists[0], "the cap of an unmeasured head may be another"
@@ -181,12 +185,12 @@ def test_a_wider_field_has_a_wider_cone_in_budget_and_hazard() -> None:
 def test_the_chain_agrees_with_two_published_instruments() -> None:
     """OPTICS.md 4.6: 0.13 mJ/cm2 in about 1 s from 0.25 mW at 48 degrees; a phone's flash of 20 to 50 lm at 15 cm."""
     lit = replace(design("imx296"), optics=design("imx296").optics.model_copy(update={"field_deg": 48.0}))
-    per_mw = next(one.value for one in chain(lit) if one.name == "lit retina")
+    per_mw = next(factor.value for factor in chain(lit) if factor.name == "lit retina")
     assert 0.25 * per_mw == pytest.approx(0.13, rel=0.1)
     wide = replace(lit, optics=lit.optics.model_copy(update={"field_deg": 46.0}))
     into_lens = 0.025**2 / 0.15**2
     low, high = (
-        1000 * lumens / 250 * into_lens * next(one.value for one in chain(wide) if one.name == "lit retina")
+        1000 * lumens / 250 * into_lens * next(factor.value for factor in chain(wide) if factor.name == "lit retina")
         for lumens in (20, 50)
     )
     assert low < 1.40 < high
@@ -195,7 +199,7 @@ def test_the_chain_agrees_with_two_published_instruments() -> None:
 def test_documents_have_the_figures_of_the_chosen_head() -> None:
     chosen = design("imx296_power")
     built, shares = at_full_drive(chosen), light_report.limit_shares(chosen, expected_beam(chosen), light_limits())
-    low, high = (f"{100 * one:.0f}" for one in (built.share.low, built.share.high))
+    low, high = (f"{100 * share:.0f}" for share in (built.share.low, built.share.high))
     small = replace(chosen, pupil_mm=7.0)
     bound = simulated(chain(chosen))
     facts = {
@@ -212,7 +216,7 @@ def test_documents_have_the_figures_of_the_chosen_head() -> None:
     readme, optics = (" ".join(text(name).split()) for name in ("hardware/README.md", "device/optics/OPTICS.md"))
     for words in (readme, decision):
         assert [what for what, figure in facts.items() if not re.search(figure, words)] == []
-    quantiles = [spaced(one) for one in (bound.low, bound.high, built.electrons.low, built.electrons.high)]
+    quantiles = [spaced(electrons) for electrons in (bound.low, bound.high, built.electrons.low, built.electrons.high)]
     for words in (readme, optics):
         assert "{} to {}".format(*quantiles[:2]) in words
         assert "{} to {}".format(*quantiles[2:]) in words
@@ -240,5 +244,5 @@ def test_gains_and_report_name_every_cause(tmp_path: Path) -> None:
     assert {"coupling", "pupil", "polarisers", "splitter", "pixel", "exposure", "safety"} == set(gains)
     assert min(gains.values()) >= 1
     words, drawn = light_report.table(chosen), light_report.gains_svg(chosen)
-    assert all(one.name in words for one in chain(chosen))
+    assert all(factor.name in words for factor in chain(chosen))
     assert all(cause in drawn for cause, gain in gains.items() if gain > 1)

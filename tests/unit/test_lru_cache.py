@@ -43,7 +43,7 @@ def test_a_dropped_or_replaced_value_is_held_no_longer() -> None:
         seen.append(weakref.ref(value))
         cache.put(number, value)
     del value
-    assert [one() is not None for one in seen] == [False, False, False, True, True]
+    assert [reference() is not None for reference in seen] == [False, False, False, True, True]
 
 
 def test_a_failed_making_drops_nothing() -> None:

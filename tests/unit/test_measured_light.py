@@ -52,7 +52,7 @@ def test_budget_and_command_give_one_share_of_the_limit(name: str) -> None:
     expected = limit_shares(design, expected_beam(design), light_limits())
     reading = MeterReading("green", expected_uw(design), 1.0, 1000 * design.led.wavelength_um, "x")
     found = judge(spec, design, reading, light_limits())
-    assert [one.used for one in found.shares[:2]] == pytest.approx([one.used for one in expected[:2]])
+    assert [share.used for share in found.shares[:2]] == pytest.approx([share.used for share in expected[:2]])
     assert found.is_go == (expected[0].used <= 1)
 
 

@@ -72,11 +72,11 @@ def assert_complete(folder: Path, numbers: list[int]) -> None:
     """Assert that this release reads all that was stored, and has nothing to recover."""
     with CaptureStore(folder, reserve_bytes=0) as store:
         assert (store.recovery, store.newly_quarantined) == (RecoveryReport(), ())
-        assert {one.id for one in store.captures()} == {f"c{n}" for n in numbers}
+        assert {capture.id for capture in store.captures()} == {f"c{n}" for n in numbers}
         assert [store.read(f"c{n}", "raw.tiff") for n in numbers] == [FILES["raw.tiff"]] * len(numbers)
         assert ledger(store).spent_j_per_cm2("OD") == sum(numbers)
-        slots = [one.slots["R-centre"].captures for one in people(store).visits(10)]
-        assert sorted(one.capture for captures in slots for one in captures) == [f"c{n}" for n in numbers]
+        slots = [visit.slots["R-centre"].captures for visit in people(store).visits(10)]
+        assert sorted(taken.capture for captures in slots for taken in captures) == [f"c{n}" for n in numbers]
 
 
 def test_tables_are_copied_and_migrated_and_a_rolled_back_release_works_on_them(
@@ -164,15 +164,15 @@ def marked(source: str) -> bool:
 def hand_made(source: str) -> list[str]:
     """Return SQL by hand that changes rows or names; docstrings are ignored."""
     upgrades = [node for node in nodes(source) if isinstance(node, ast.FunctionDef) and node.name == "upgrade"]
-    calls = [node for one in upgrades for node in ast.walk(one) if isinstance(node, ast.Call)]
+    calls = [node for upgrade in upgrades for node in ast.walk(upgrade) if isinstance(node, ast.Call)]
     statements = [str(arg.value).upper() for call in calls for arg in call.args if isinstance(arg, ast.Constant)]
     return [word for word in CHANGES for line in statements if word in line]
 
 
 def test_a_migration_only_adds(tmp_path: Path, migrations: Path) -> None:
     """Of this release, and the made-up one."""
-    scripts = sorted(ScriptDirectory(str(migrations)).walk_revisions(), key=lambda one: one.revision)
-    assert [one.revision for one in scripts][:2] == [FIRST, SECOND]
+    scripts = sorted(ScriptDirectory(str(migrations)).walk_revisions(), key=lambda script: script.revision)
+    assert [script.revision for script in scripts][:2] == [FIRST, SECOND]
     before: dict[str, str] = {}
     for script in scripts:
         after = definitions(migrations, tmp_path / f"{script.revision}.sqlite", script.revision)
@@ -187,9 +187,11 @@ def test_the_tables_are_those_that_the_code_describes(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / schema.DATABASE)) as tables:
         for name, table in schema.Base.metadata.tables.items():
             columns = {(row[1], row[2], bool(row[3])) for row in tables.execute(f"PRAGMA table_xinfo({name})")}
-            assert columns == {(one.name, one.type.compile(), not one.nullable) for one in table.columns}, name
+            assert columns == {(column.name, column.type.compile(), not column.nullable) for column in table.columns}, (
+                name
+            )
             indexes = {row[1] for row in tables.execute(f"PRAGMA index_list({name})") if row[3] == "c"}
-            assert indexes == {one.name for one in table.indexes}, name
+            assert indexes == {index.name for index in table.indexes}, name
 
 
 @pytest.mark.parametrize(
@@ -300,4 +302,4 @@ def test_a_report_without_usable_entries_has_empty_columns(report: str, tmp_path
             other.execute("UPDATE captures SET report = ?", (report,))
             (columns,) = other.execute("SELECT visit, slot, verdict, laterality FROM captures").fetchall()
         assert columns == (None, None, None, None)
-        assert [one.slots["R-centre"].captures for one in people(store).visits(10)] == [(SlotCapture("c1", None),)]
+        assert [visit.slots["R-centre"].captures for visit in people(store).visits(10)] == [(SlotCapture("c1", None),)]

@@ -50,7 +50,7 @@ def test_a_small_field_is_placed_by_its_retina_and_not_by_its_edge(shift_px: tup
 
 def test_the_small_fields_of_different_retinas_are_not_joined_by_their_edges() -> None:
     pictures = [small_field_gaze(sparse_retina(seed), (0, 0), seed) for seed in range(4)]
-    assert [one.used for one in make_montage(pictures).placed] == [True, False, False, False]
+    assert [place.used for place in make_montage(pictures).placed] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -64,7 +64,7 @@ def test_what_stands_still_at_the_edge_places_no_picture(same: bool) -> None:
         * (np.cos(24 * angle) + np.cos(5 * angle))
     )
     pictures = [small_field_gaze(sparse_retina(seed), (0, 0), k) for k, seed in enumerate((0, 0 if same else 1))]
-    found = make_montage([np.asarray(one * (1 + ring), np.float32) for one in pictures]).placed[1]
+    found = make_montage([np.asarray(picture * (1 + ring), np.float32) for picture in pictures]).placed[1]
     assert found.used is same, found
 
 
@@ -110,7 +110,7 @@ def test_three_turns_about_different_axes_are_composed_as_rotations() -> None:
     placed = make_montage(
         [turned_gaze(WIDE_RETINA, step, 0, k, PX_PER_DEG) for k, step in enumerate(steps)], px_per_deg=PX_PER_DEG
     ).placed
-    assert all(one.used for one in placed)
+    assert all(place.used for place in placed)
     assert placed[2].shift_px == pytest.approx(steps[2], abs=1.2)  # twice the error of one step
     assert placed[2].rotation_deg == pytest.approx(0, abs=0.6)
 
@@ -134,7 +134,7 @@ def test_the_sphere_of_a_small_field_is_the_plane() -> None:
     plane, sphere = Plane(), Sphere(1e5)  # a picture of 0.002 degrees
     assert sphere.moved(here, motion) == pytest.approx(plane.moved(here, motion), abs=1e-6)
     assert plane.moved_back(plane.moved(here, motion), motion) == pytest.approx(here)
-    both, flat = (one.composed(motion, then) for one in (sphere, plane))
+    both, flat = (projection.composed(motion, then) for projection in (sphere, plane))
     assert both.shift == pytest.approx(flat.shift, abs=1e-6)
     assert both.rotation_deg == pytest.approx(flat.rotation_deg, abs=1e-6)
 
@@ -160,7 +160,7 @@ def test_the_montage_shows_the_retina_of_all_pictures_on_the_plane_of_the_first(
 def test_a_picture_is_placed_by_another_one_than_the_first() -> None:
     steps = [(0.0, 0.0), (75.0, 20.0), (150.0, 40.0)]
     placed = make_montage([gaze(WIDE_RETINA, step, 0, k) for k, step in enumerate(steps)]).placed
-    assert all(one.used for one in placed)
+    assert all(place.used for place in placed)
     assert placed[2].shift_px == pytest.approx(steps[2], abs=1.2)  # twice the error of one step
 
 
@@ -169,8 +169,8 @@ def test_another_eye_and_a_small_overlap_stay_apart_with_the_reason() -> None:
     far = gaze(WIDE_RETINA, (150, 40), 0, 1)  # an overlap of 0.12
     other = gaze(np.asarray(ndimage.zoom(OTHER_RETINA, 1.5, order=3), np.float32), (0, 0), 0, 2)
     joined = make_montage([first, far, other])
-    assert [one.used for one in joined.placed] == [True, False, False]
-    assert all(one.reason and one.shift_px is None for one in joined.placed[1:])
+    assert [place.used for place in joined.placed] == [True, False, False]
+    assert all(place.reason and place.shift_px is None for place in joined.placed[1:])
     assert joined.picture.shape == first.shape
 
 
@@ -215,7 +215,7 @@ def test_pictures_that_cannot_be_joined_are_refused() -> None:
 
 def test_pictures_in_colour_are_placed_by_their_green_channel_and_keep_their_colour() -> None:
     first, second = (gaze(WIDE_RETINA, shift, 0, k) for k, shift in enumerate([(0.0, 0.0), (20.0, 60.0)]))
-    joined = make_montage([np.stack([2 * one, one, one / 2], axis=2) for one in (first, second)])
+    joined = make_montage([np.stack([2 * picture, picture, picture / 2], axis=2) for picture in (first, second)])
     assert joined.placed[1].shift_px == pytest.approx((20, 60), abs=0.6)
     red, green, blue = (joined.picture[..., channel][joined.picture[..., 1] > 0.2] for channel in range(3))
     assert red == pytest.approx(2 * green, rel=1e-4)

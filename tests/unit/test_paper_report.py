@@ -126,7 +126,7 @@ def test_each_experiment_exists_once() -> None:
 def test_report_of_one_experiment_is_written(tmp_path) -> None:
     progress = []
     found = run_experiments(tmp_path / "new", VirtualClock(), progress.append, ["N"])
-    assert [one.experiment.key for one in found] == ["N"]
+    assert [run.experiment.key for run in found] == ["N"]
     assert progress == ["N: 8 of 8 assertions hold"]
     assert "The paper&#x27;s numbers" in (tmp_path / "new" / "report.html").read_text()
 
@@ -134,7 +134,7 @@ def test_report_of_one_experiment_is_written(tmp_path) -> None:
 def test_several_experiments_run_in_processes_and_stand_in_their_order(tmp_path) -> None:
     progress = []
     found = run_experiments(tmp_path, VirtualClock(), progress.append, ["T", "N"])
-    assert [one.experiment.key for one in found] == ["N", "T"]
+    assert [run.experiment.key for run in found] == ["N", "T"]
     assert sorted(line.split(":")[0] for line in progress) == ["N", "T"]
     assert found[1].seconds > 0, "by the clock of the process, not the virtual one"
     page = (tmp_path / "report.html").read_text()
@@ -158,11 +158,13 @@ def test_unknown_experiment_and_unwritable_folder_are_refused(tmp_path) -> None:
 
 
 def test_merged_pixels_scale_light_full_well_and_noise() -> None:
-    one, two = (Bench(n).scene("paper_heine") for n in (1, 2))
-    assert (two.camera.rows, two.camera.cols) == (one.camera.rows // 2, one.camera.cols // 2)
-    assert two.camera.pitch_um == 2 * one.camera.pitch_um
-    assert two.sim.peak_e / two.camera.full_well_e == one.sim.peak_e / one.camera.full_well_e
-    assert two.sim.peak_e / two.camera.read_noise_e**2 == pytest.approx(one.sim.peak_e / one.camera.read_noise_e**2)
+    plain, merged = (Bench(n).scene("paper_heine") for n in (1, 2))
+    assert (merged.camera.rows, merged.camera.cols) == (plain.camera.rows // 2, plain.camera.cols // 2)
+    assert merged.camera.pitch_um == 2 * plain.camera.pitch_um
+    assert merged.sim.peak_e / merged.camera.full_well_e == plain.sim.peak_e / plain.camera.full_well_e
+    assert merged.sim.peak_e / merged.camera.read_noise_e**2 == pytest.approx(
+        plain.sim.peak_e / plain.camera.read_noise_e**2
+    )
 
 
 def test_change_of_a_scene_is_validated() -> None:

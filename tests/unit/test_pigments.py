@@ -29,11 +29,11 @@ def test_melanin_varies_the_reflectance_as_between_persons() -> None:
 
 
 @given(colours, st.floats(0, 3), st.floats(0, 3))
-def test_absorbances_add(colour: Colour, one: float, other: float) -> None:
+def test_absorbances_add(colour: Colour, left: float, right: float) -> None:
     """A pigment in two layers transmits the product of what each of them transmits."""
     clear = 1 - Pigments(haemoglobin=0).blood(BLOOD[colour])
-    first, second = (1 - Pigments(haemoglobin=part).blood(BLOOD[colour]) for part in (one, other))
-    both = (1 - BLOOD[colour]) ** (one + other)
+    first, second = (1 - Pigments(haemoglobin=part).blood(BLOOD[colour]) for part in (left, right))
+    both = (1 - BLOOD[colour]) ** (left + right)
     assert clear == 1
     assert first * second == pytest.approx(both)
 
@@ -47,7 +47,7 @@ def test_macular_pigment_is_seen_in_blue_and_not_in_red(quantity: float) -> None
 
 @given(colours, st.floats(0, 3))
 def test_macular_pigment_absorbs_at_the_fovea_and_never_below_0(colour: Colour, quantity: float) -> None:
-    mean, eye = (1 - AT_FOVEA * Pigments(macular=one).macula(colour, MACULA[colour]) for one in (1.0, quantity))
+    mean, eye = (1 - AT_FOVEA * Pigments(macular=amount).macula(colour, MACULA[colour]) for amount in (1.0, quantity))
     assert eye > 0
     assert eye / mean == pytest.approx(
         10 ** (-2 * 0.35 * {"red": 0, "green": 0.15, "blue": 0.95}[colour] * (quantity - 1))

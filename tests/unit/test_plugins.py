@@ -170,10 +170,10 @@ def test_a_plug_in_that_fails_costs_its_own_points_only(tmp_path: Path) -> None:
         found = measure_frontier(case, tmp_path, 5.0, 1, print, selected_methods(["gradient", "late"]))
     assert {p.rounds for p in found.points if p.method == "late"} == {0, 1, 2, 4, 8}
     assert {p.method for p in found.points} == {"gradient", "late"}
-    assert [one.method for one in found.left_out if "bin 1," in str(one.method)] == [
+    assert [left_out.method for left_out in found.left_out if "bin 1," in str(left_out.method)] == [
         f"late, bin 1, {rounds} rounds" for rounds in (12, 20, 60)
     ]
-    assert all("NaN" in one.reason for one in found.left_out)
+    assert all("NaN" in left_out.reason for left_out in found.left_out)
 
 
 @pytest.mark.usefixtures("own_solver")
@@ -286,7 +286,7 @@ def scene_file(folder: Path, tables: str = DUST) -> Path:
 
 
 def explained(spec: InstrumentSpec) -> dict[str, float]:
-    return {one.name: one.eta for one in decide(Scene(spec, spec.light.colour))}
+    return {decision.name: decision.eta for decision in decide(Scene(spec, spec.light.colour))}
 
 
 @pytest.mark.usefixtures("own_effect")

@@ -111,8 +111,8 @@ def test_a_slow_meter_shows_half() -> None:
 def test_a_reading_at_a_level_is_judged_as_at_full_drive() -> None:
     full = MeterReading("green", 9.0, 43.0, 525.0, "meter X, 2026-11-25")
     dim = replace(full, axis_uw=0.252 * full.axis_uw, waist_mw_per_cm2=0.252 * full.waist_mw_per_cm2).scaled(0.252)
-    shares = [judge(POWER, design_of(POWER), one, light_limits()).shares for one in (full, dim)]
-    assert [one.value for one in shares[1]] == pytest.approx([one.value for one in shares[0]])
+    shares = [judge(POWER, design_of(POWER), reading, light_limits()).shares for reading in (full, dim)]
+    assert [share.value for share in shares[1]] == pytest.approx([share.value for share in shares[0]])
 
 
 @pytest.mark.parametrize(("shown", "status", "says"), [("1", 0, "GO at this level"), ("60", 1, "NO GO")])

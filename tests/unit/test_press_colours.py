@@ -53,12 +53,12 @@ def test_a_press_of_a_ring_with_amber_gives_a_picture_in_colour(tmp_path: Path) 
         pipeline = plan_pipeline(head, clock, tmp_path)
         assert pipeline.colours is not None
         green_steps = pipeline.reconstructor.steps(press.lit[0].counts, simulated=True)
-        others = {colour: [one.counts] for colour, one in press.colours.items()}
+        others = {colour: [frame.counts] for colour, frame in press.colours.items()}
         *_, made = pipeline.colours.steps(green_steps, others, simulated=True, missing=press.missing)
     finally:
         head.close()
     assert isinstance(made, ColourReconstruction)
-    assert [(one.name, one.predicted) for one in made.report.channels] == [
+    assert [(channel.name, channel.predicted) for channel in made.report.channels] == [
         ("green", False),
         ("amber", False),
         ("blue", True),

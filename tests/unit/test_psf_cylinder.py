@@ -118,7 +118,9 @@ def test_predicted_gain_is_that_of_wiener_filters_on_drawn_objects() -> None:
     low, high = band(frequency, np.abs(model.stored) ** 2, 96)
     law, noise_dn = PowerLaw(15.0, 2.0), 3.0
     power = np.exp(law.log_power) * (np.maximum(frequency, low) / np.sqrt(low * high)) ** -law.slope
-    eye, sphere = (otf(warped(moving_retina.PSF, transform(GEOMETRY, *one)), grid) for one in (EYE, EYE[:1]))
+    eye, sphere = (
+        otf(warped(moving_retina.PSF, transform(GEOMETRY, *wavefront)), grid) for wavefront in (EYE, EYE[:1])
+    )
     errors, random = np.zeros(2), np.random.default_rng(3)
     for _ in range(40):
         true = np.fft.rfft2(random.standard_normal((96, 96))) / 96 * np.sqrt(power)

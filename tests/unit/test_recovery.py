@@ -67,7 +67,7 @@ def test_captures_without_rows_are_adopted_with_all_that_was_stored(store: Captu
     without_rows(store.folder, *LOST_ROWS)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert (again.recovery.adopted, again.newly_quarantined) == (["a", "b"], ())
-        assert sorted(again.captures(), key=lambda one: one.id) == sorted(kept, key=lambda one: one.id)
+        assert sorted(again.captures(), key=lambda capture: capture.id) == sorted(kept, key=lambda capture: capture.id)
         assert {name: again.read("a", name) for name in FILES} == FILES
         assert again.quarantine.orphans() == []
     with CaptureStore(store.folder, reserve_bytes=0) as once_more:
@@ -88,7 +88,7 @@ def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> 
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.get("a") == stored, "the record holds the correction of the eye"
         slots = VisitRepository(again.engine, load_protocol(), VirtualClock()).get(visit).slots
-        assert [one.capture for one in slots["L-centre"].captures] == ["a"]
+        assert [taken.capture for taken in slots["L-centre"].captures] == ["a"]
         assert slots["L-centre"].captures == moved.slots["L-centre"].captures
 
 
@@ -107,7 +107,7 @@ def test_an_entry_that_is_no_json_rebuilds_the_database(store: CaptureStore) -> 
     flip(store.folder / "store.sqlite", b'"level": 0.25', b'"level"; 0.25', nth=1)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.recovery.rebuilt_because == "CHECK constraint failed in captures"
-        assert sorted(again.captures(), key=lambda one: one.id) == kept
+        assert sorted(again.captures(), key=lambda capture: capture.id) == kept
     assert (store.folder / "damaged" / "1" / "store.sqlite").exists()
 
 
@@ -206,8 +206,8 @@ def test_an_older_database_does_not_undo_later_changes(tmp_path: Path) -> None:
     (folder / "store.sqlite").write_bytes(older)
     with CaptureStore(folder, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
-        assert tuple(people.get(one.id) for one in latest) == latest
-        assert sorted(store.recovery.visits) == sorted(one.id for one in latest)
+        assert tuple(people.get(stored_visit.id) for stored_visit in latest) == latest
+        assert sorted(store.recovery.visits) == sorted(stored_visit.id for stored_visit in latest)
         assert store.recovery.conflicts == []
 
 
@@ -284,11 +284,11 @@ def test_after_older_tables_were_changed_the_later_change_is_used_and_the_other_
     without_rows(tmp_path, f"UPDATE answers SET value = '{age}', set_at = '{set_at}' WHERE name = 'age'")
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
-        assert {one.id for one in store.captures()} == {"old", "new"}
+        assert {capture.id for capture in store.captures()} == {"old", "new"}
         assert {name: store.read("new", name) for name in FILES} == FILES
         assert people.get(visit).fields["age"] == used
         stored = [json.loads(path.read_bytes())["record"] for path in (tmp_path / "conflicts").glob(f"visit-{visit}-*")]
-        assert [one["answers"]["age"]["value"] for one in stored] == [other]
+        assert [record["answers"]["age"]["value"] for record in stored] == [other]
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         assert store.recovery == RecoveryReport()
 
@@ -317,9 +317,12 @@ def test_a_number_that_was_given_again_in_older_tables_mixes_up_no_patients(
     for _ in range(2):
         with CaptureStore(tmp_path, reserve_bytes=0) as store:
             people = VisitRepository(store.engine, load_protocol(), clock)
-            found = {one.id: (one.number, one.fields["name"], one.fields["age"]) for one in people.visits(10)}
+            found = {
+                stored_visit.id: (stored_visit.number, stored_visit.fields["name"], stored_visit.fields["age"])
+                for stored_visit in people.visits(10)
+            }
             assert found == {"v1": (number, "Usha", 51), visit: (other, "Asha", 30)}
-    assert sorted(one.content["number"] for one in documents(tmp_path)) == sorted([number, other])
+    assert sorted(document.content["number"] for document in documents(tmp_path)) == sorted([number, other])
 
 
 def documents(folder: Path) -> list[RecordDocument]:
@@ -336,7 +339,7 @@ def test_a_damaged_id_of_a_patient_is_restored(store: CaptureStore) -> None:
     flip(store.folder / "store.sqlite", id.encode(), changed.encode())
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert VisitRepository(again.engine, load_protocol(), VirtualClock()).visits(10) == before
-    assert [one.id for one in documents(store.folder)] == [id]
+    assert [document.id for document in documents(store.folder)] == [id]
 
 
 def test_a_changed_definition_of_a_table_rebuilds_the_database(store: CaptureStore) -> None:

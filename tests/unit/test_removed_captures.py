@@ -64,7 +64,9 @@ def test_removed_files_are_named_as_removed_and_come_back_bit_for_bit(store: Cap
             assert store.read("a", name) == FILES[name]
         assert store.read("b", name) == FILES[name]
     assert store.get("a").id == "a"
-    assert all(one.is_whole for one in check_store(store.folder, lambda line: None) if "ledger" not in one.name)
+    assert all(
+        result.is_whole for result in check_store(store.folder, lambda line: None) if "ledger" not in result.name
+    )
     assert store.removed.undo() == 1
     assert {name: store.read("a", name) for name in FILES} == FILES
     assert store.removed.removal("a") is None
@@ -136,7 +138,7 @@ def test_a_finished_visit_is_removable_once_it_was_sent_or_exported(tmp_path: Pa
             finished.append(people.finish(next(keys), id))
         assert removal.removable().visits == 0
         queue, exports = UploadQueue(store.engine, clock), ExportRecords(store.folder)
-        sent = next(one for one in queue.queued() if one.visit == finished[0].id)
+        sent = next(entry for entry in queue.queued() if entry.visit == finished[0].id)
         queue.record_success(sent, UploadReceipt("0" * 64, "sha256"))
         state = finished[1].finished_at
         assert state is not None

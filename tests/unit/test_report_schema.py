@@ -55,9 +55,9 @@ def test_every_key_of_every_report_has_a_description() -> None:
     )
     properties = schema["properties"]
     assert isinstance(properties, dict)
-    files = {one.name for one in fields(FileReport)}
+    files = {field.name for field in fields(FileReport)}
     assert set(properties) == files | {*full.as_json(), "simulated"}
-    assert schema["required"] == [one.name for one in fields(Report) if one.name in CaptureReport().as_json()]
+    assert schema["required"] == [field.name for field in fields(Report) if field.name in CaptureReport().as_json()]
 
 
 @pytest.mark.parametrize("file", KEPT, ids=lambda path: path.parent.name)

@@ -319,9 +319,9 @@ def test_a_shorter_frame_of_a_moving_eye_has_a_shorter_blur_and_step():
     assert moving.eyes.parts(0.05) == 2
     moved = float(np.abs(frames[1] - frames[0]).max())
 
-    def apart(one, other):
+    def apart(left, right):
         """Return the difference of two frames in steps of one exposure."""
-        return float(np.abs(one - other).max()) / moved
+        return float(np.abs(left - right).max()) / moved
 
     # 0.1: light from beyond the edge of the field is smeared with the picture in one long frame
     assert apart(halves[0] + halves[1], frames[0]) < 0.1

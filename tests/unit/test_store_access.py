@@ -116,7 +116,7 @@ def test_a_store_that_may_only_be_read_is_shown_and_takes_nothing(folder: Path) 
 
     assert run_as(OTHER_USER_ID, read) == 0
     with opened_store(folder, VirtualClock()) as store:
-        assert [one.id for one in store.captures()] == ["mine"]
+        assert [record.id for record in store.captures()] == ["mine"]
         assert store.refusal is None
 
 
@@ -151,8 +151,8 @@ def test_two_programs_on_one_store_lose_nothing(folder: Path) -> None:
     assert [writer.wait(120) for writer in writers] == [0, 0]
     with CaptureStore(folder, reserve_bytes=0) as store:
         expected = {"mine", *(f"{name}-{number}" for name in ("first", "second") for number in range(ADDED))}
-        assert {one.id for one in store.captures()} == expected
-        assert all(store.read(one, name) == FILES[name] for one in expected for name in FILES)
+        assert {record.id for record in store.captures()} == expected
+        assert all(store.read(capture_id, name) == FILES[name] for capture_id in expected for name in FILES)
         assert store.newly_quarantined == ()
 
 

@@ -25,7 +25,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Shown]:
 
 def check(folder: Path) -> tuple[int, dict[str, Any]]:
     done = CliRunner().invoke(app, ["check", "--json", "--data", str(folder)])
-    return done.exit_code, {one["name"]: one for one in json.loads(done.stdout)}
+    return done.exit_code, {result["name"]: result for result in json.loads(done.stdout)}
 
 
 def content(folder: Path) -> dict[str, bytes]:

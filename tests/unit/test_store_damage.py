@@ -21,4 +21,4 @@ def test_no_damage_of_one_file_is_silent(stores: dict[bool, Path], tmp_path: Pat
     every = plan(20 * SAMPLE)
     trials = [run_trial(stores, before, trial, tmp_path) for trial in every[:: len(every) // SAMPLE]]
     assert len(trials) >= SAMPLE
-    assert not [one for one in trials if one.violations]
+    assert not [trial for trial in trials if trial.violations]

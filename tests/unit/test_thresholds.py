@@ -25,7 +25,7 @@ DAY = datetime(2026, 11, 20, tzinfo=UTC)
 
 
 def check(name: str, **facts: object) -> Check:
-    return next(one for one in run_checks(replace(HEALTHY, **facts)) if one.name == name)
+    return next(result for result in run_checks(replace(HEALTHY, **facts)) if result.name == name)
 
 
 @pytest.mark.parametrize(("head_c", "hot"), [(54.99, False), (55.0, False), (55.01, True)])

@@ -71,7 +71,7 @@ class Run:
             list[RunOutcome](),
             list[KnownCheck](),
         )
-        self.known = {one.lens: one for one in readings(off)}
+        self.known = {reading.lens: reading for reading in readings(off)}
         light = GuardedLight(SimLight(self.world), self.clock, 1.0, hazard_of(of.spec), MemoryLedger(self.clock))
         self.placed: list[tuple[TrialLens, float]] = []
         self.head = Head(
@@ -154,7 +154,7 @@ def begin(template: tuple[World, Calibration], tmp_path: Path) -> Iterator[Begin
 def test_each_lens_is_asked_for_once_and_the_offset_is_then_in_force(begin: Begin) -> None:
     run = begin()
     for number in range(len(TRIAL_LENSES)):
-        assert [one.lens for one in run.asked(number).found.values()] == list(TRIAL_LENSES[:number])
+        assert [reading.lens for reading in run.asked(number).found.values()] == list(TRIAL_LENSES[:number])
         assert run.placed[number:] == [(TRIAL_LENSES[number], 12.0)]
         run.session.ready(number)
     outcome = run.outcome()
@@ -176,7 +176,7 @@ def test_a_head_outside_its_limits_is_refused_with_its_findings(begin: Begin) ->
     lenses = run.refused()
     assert isinstance(lenses.failure, CalibrationRefused)
     assert lenses.fit is not None
-    (failing,) = (one for one in lenses.fit.findings if one.fails)
+    (failing,) = (finding for finding in lenses.fit.findings if finding.fails)
     assert (failing.name, failing.remedy) == ("offset", lenses.failure.remedy)
 
 

@@ -92,8 +92,8 @@ def test_the_fit_finds_offset_slope_and_axis_of_a_head() -> None:
 
 def test_the_sds_of_the_fit_hold_its_errors() -> None:
     fits = [fit_trial_lenses(readings(PowerVector(0.1, 0.0, -0.1), seed=seed), VERTEX_MM) for seed in range(300)]
-    off = np.array([(one.offset.m_dpt - 0.1, one.offset.j0_dpt, one.offset.j45_dpt + 0.1) for one in fits])
-    sds = np.array([(one.offset.m_sd_dpt, one.offset.j0_sd_dpt, one.offset.j45_sd_dpt) for one in fits])
+    off = np.array([(fit.offset.m_dpt - 0.1, fit.offset.j0_dpt, fit.offset.j45_dpt + 0.1) for fit in fits])
+    sds = np.array([(fit.offset.m_sd_dpt, fit.offset.j0_sd_dpt, fit.offset.j45_sd_dpt) for fit in fits])
     rms = np.sqrt(((off / sds) ** 2).mean(axis=0))
     assert (rms < 1.1).all()  # 1.04 is one sd of an rms of 300
     assert (rms[1:] > 0.8).all()  # 0.93 on average: the sd grows with the scatter and never shrinks
@@ -101,7 +101,7 @@ def test_the_sds_of_the_fit_hold_its_errors() -> None:
 
 
 def failing(fit: TrialLensFit) -> list[str]:
-    return [one.name for one in fit.findings if one.fails]
+    return [finding.name for finding in fit.findings if finding.fails]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_a_head_outside_one_limit_is_refused_with_its_remedy(errors, name: str, 
     assert failing(fit) == [name]
     with pytest.raises(CalibrationRefused, match=message) as error:
         refuse_beyond_limits(fit)
-    assert error.value.remedy == next(one.remedy for one in fit.findings if one.fails)
+    assert error.value.remedy == next(finding.remedy for finding in fit.findings if finding.fails)
 
 
 def test_a_wrong_lens_is_named() -> None:
@@ -130,14 +130,14 @@ def test_a_wrong_lens_is_named() -> None:
     with pytest.raises(CalibrationRefused) as error:
         refuse_beyond_limits(fit_trial_lenses(shown, VERTEX_MM))
     fit = fit_trial_lenses(shown, VERTEX_MM)
-    line = next(one for one in fit.findings if one.name == "line")
+    line = next(finding for finding in fit.findings if finding.name == "line")
     assert line.fails
     assert "+2.00" in line.remedy
     assert error.value.remedy, "the first of the failing findings has a remedy"
 
 
 def test_noisy_readings_are_refused_before_a_limit_is_judged() -> None:
-    noisy = [replace(one, sds=PowerVector(0.6, 0.4, 0.4)) for one in readings()]
+    noisy = [replace(reading, sds=PowerVector(0.6, 0.4, 0.4)) for reading in readings()]
     with pytest.raises(CalibrationRefused, match=r"the offset is known to .* only"):
         refuse_beyond_limits(fit_trial_lenses(noisy, VERTEX_MM))
 
@@ -233,7 +233,7 @@ def test_a_reconstruction_reports_the_refraction_without_the_offset() -> None:
     made = [make(counts)]
     make.calibration = replace(make.calibration, refraction_offset=OFFSET)  # a second one would be warmed up again
     made.append(make(counts))
-    before, after = (one.report.refraction_dpt for one in made)
+    before, after = (reconstruction.report.refraction_dpt for reconstruction in made)
     changes = [after[key] - before[key] for key in ("sphere", "j0", "j45")]
     assert changes == pytest.approx([-0.3, 0.1, -0.15])
     assert np.array_equal(made[0].picture, made[1].picture), "the PSF is scaled as the frame says"

@@ -161,7 +161,7 @@ def test_versions_compare_as_numbers(tmp_path: Path) -> None:
 
 def test_release_without_kernel_is_refused_where_the_kernel_has_modules(tmp_path: Path) -> None:
     """Where the running kernel has modules, a release needs its own kernel; elsewhere both kinds are accepted."""
-    with_kernel, without = (Release("here", "2.9", "1.0", "", has_kernel=one) for one in (True, False))
+    with_kernel, without = (Release("here", "2.9", "1.0", "", has_kernel=has_kernel) for has_kernel in (True, False))
     for release in (with_kernel, without):
         refuse_unsuitable(release, "here", "2.8", tmp_path)
     (tmp_path / os.uname().release).mkdir()

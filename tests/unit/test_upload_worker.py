@@ -75,7 +75,7 @@ class QueueSetup:
         self.store.save(capture, {"picture.png": b"png", "report.json": b"{}", "raw.tiff": b"raw"}, target.write_rows)
 
     def queued(self) -> list[str]:
-        return [one.visit for one in self.queue.queued()]
+        return [entry.visit for entry in self.queue.queued()]
 
 
 @pytest.fixture
@@ -184,8 +184,8 @@ def test_queued_visits_have_a_size_and_are_ordered_by_finish(setup: QueueSetup) 
     for visit in (second, first):
         setup.finish(visit)
     found = setup.queue.queued(sizes=True)
-    assert [(one.visit, one.size_bytes) for one in found] == [(second, 2 * len(b"png{}")), (first, 0)]
-    assert [one.visit for one in setup.queue.queued(1)] == [second]
+    assert [(entry.visit, entry.size_bytes) for entry in found] == [(second, 2 * len(b"png{}")), (first, 0)]
+    assert [entry.visit for entry in setup.queue.queued(1)] == [second]
 
 
 # Worker

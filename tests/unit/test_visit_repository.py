@@ -46,8 +46,8 @@ def test_the_best_picture_is_chosen_until_the_user_decides(store: CaptureStore, 
     visit = agreed(people)
 
     def chosen() -> str | None:
-        one = people.get(visit).slots["R-centre"].chosen
-        return one.capture if one else None
+        taken = people.get(visit).slots["R-centre"].chosen
+        return taken.capture if taken else None
 
     shoot(store, people, visit, "R-centre", "poor", "again")
     assert chosen() == "poor"  # a poor picture is better than none
@@ -74,7 +74,7 @@ def test_a_capture_requested_before_the_finish_is_stored(store: CaptureStore, pe
     people.finish(next(keys), visit)
     report = CaptureReport(visit=target.visit, slot=target.slot)
     store.save(Capture("late", "OD", people.clock.wall(), True, "00ff", report, {}), FILES, target.write_rows)
-    assert [one.capture for one in people.get(visit).slots["R-centre"].captures] == ["late"]
+    assert [taken.capture for taken in people.get(visit).slots["R-centre"].captures] == ["late"]
     ending = people.get(visit).outcome
     assert ending is not None
     assert ending.sentence == "Refer: picture of the left eye not taken."  # the right eye has a picture now

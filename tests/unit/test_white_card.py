@@ -78,8 +78,8 @@ def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tm
         retina = world(measured.spec).retina
         assert press.dark is not None
         lights = {
-            lit(one).colour: (one.counts.mean() - press.dark.counts.mean()) / (one.exposure_s * lit(one).level)
-            for one in (press.lit[0], press.colours["red"])
+            lit(frame).colour: (frame.counts.mean() - press.dark.counts.mean()) / (frame.exposure_s * lit(frame).level)
+            for frame in (press.lit[0], press.colours["red"])
         }
         green = pipeline.reconstructor.steps(press.lit[0].counts, simulated=True)
         assert pipeline.colours is not None
@@ -88,7 +88,7 @@ def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tm
     finally:
         head.close()
     assert isinstance(made, ColourReconstruction)
-    shares = {one.name: one.white_ratio for one in made.report.channels}
+    shares = {channel.name: channel.white_ratio for channel in made.report.channels}
     planes = {colour: retina.plane(colour) for colour in lights}
     # 1 %: a dark level that is off by 0.2 DN under the mean of 30 DN of the eye
     assert shares == {
