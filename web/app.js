@@ -93,8 +93,8 @@ async function loadRoute(route) {
   if (route.screen === "pictures") refreshMontages(route.visit);
   if (route.screen === "compare") {
     const captures = await Promise.all([route.capture, route.other].map((id) => alertOnError(() => getCapture(id))));
-    const found = captures.filter((one) => one !== undefined);
-    const foreign = found.find((one) => one.visit !== route.visit);
+    const found = captures.filter((capture) => capture !== undefined);
+    const foreign = found.find((capture) => capture.visit !== route.visit);
     if (get().route !== route) return;
     if (foreign) rejectForeignCapture(route, foreign);
     else set({ compared: Object.freeze(found) });

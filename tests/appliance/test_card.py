@@ -84,9 +84,9 @@ def mounted(file: Path, where: dict[str, int], at: Path) -> Iterator[Path]:
         run("umount", at)
 
 
-def same(one: Path, other: Path, where: dict[str, int]) -> bool:
+def same(left: Path, right: Path, where: dict[str, int]) -> bool:
     """Return whether the first 8 MiB of a partition are equal on both cards."""
-    with one.open("rb") as first, other.open("rb") as second:
+    with left.open("rb") as first, right.open("rb") as second:
         first.seek(where["at"])
         second.seek(where["at"])
         size = min(where["bytes"], 8 << 20)
@@ -168,7 +168,7 @@ def test_bundle_of_a_card_needs_the_kernel_of_its_root(card: Path, tmp_path: Pat
     assert made.returncode == 0, made.stderr
     keyring = f"--keyring={card.parents[1] / 'keys/ca.crt'}"
     info = json.loads(run("rauc", keyring, "info", "--output-format=json", ours.with_suffix(".raucb")))
-    assert {name: image["filename"] for one in info["images"] for name, image in one.items()} == {
+    assert {name: image["filename"] for entry in info["images"] for name, image in entry.items()} == {
         "rootfs": "rootfs.img",
         "boot": "boot.img",
     }

@@ -130,9 +130,9 @@ def check_disk(left: Path, marks: str, images: dict[str, bytes]) -> str:
 def test_every_disk_state_after_a_power_cut_boots_and_reports_the_outcome(recording: Recording) -> None:
     seen, outcomes = set[int](), Counter[str]()
     for marks, left in cuts(recording, random.Random(1)):
-        if (one := hash((tuple(left.items()), "<installed>" in marks, "<committed>" in marks))) in seen:
+        if (disk_hash := hash((tuple(left.items()), "<installed>" in marks, "<committed>" in marks))) in seen:
             continue
-        seen.add(one)
+        seen.add(disk_hash)
         with TemporaryDirectory(dir="/dev/shm") as place:
             outcomes[check_disk(write_tree(left, Path(place) / "left"), marks, recording.images)] += 1
     print(f"{len(seen)} disks: {dict(outcomes)}")  # noqa: T201  # figures quoted in the README

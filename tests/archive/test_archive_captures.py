@@ -84,7 +84,7 @@ def test_whole_captures_are_computed_as_the_instrument_does(
     store, (burst, other, single) = taken
     for capture in (burst, other):
         row = rows.loc[capture.id]
-        used = [one.used for one in capture.report.frames]  # a burst may leave out a frame of it
+        used = [frame.used for frame in capture.report.frames]  # a burst may leave out a frame of it
         assert (row["frames"], row["frames_used"]) == (len(used), sum(used))
         assert list(row["channels"]) == ["green", "red"]
         assert list(row["predicted_channels"]) == ["blue"]
@@ -142,7 +142,7 @@ def test_a_store_adopts_results_once_beside_the_pictures_as_taken(
             assert version.method == "variation"
         busy = archive("adopt", ran[1], "--data", store)
     assert (busy.returncode, "the instrument is running" in busy.stderr) == (2, True)
-    assert next(one for one in check_store(store, lambda _: None) if one.name == "files of captures").is_whole
+    assert next(check for check in check_store(store, lambda _: None) if check.name == "files of captures").is_whole
 
 
 def test_results_of_other_frames_and_other_folders_are_refused(

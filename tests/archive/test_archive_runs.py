@@ -43,7 +43,7 @@ def whole(scene: Scene, archive: Archive, tmp_path_factory: pytest.TempPathFacto
 
 def test_every_capture_has_one_result_and_one_row(whole: tuple[Path, Path]) -> None:
     plan, out = whole
-    names = [one.result for one in read_plan(plan).captures]
+    names = [capture.result for capture in read_plan(plan).captures]
     assert sorted(path.name for path in out.glob("results/*/*")) == sorted(names)
     rows = pd.read_parquet(out / "captures.parquet")
     assert list(rows["result"]) == names
@@ -83,7 +83,7 @@ def wait_for_results(out: Path, least: int) -> None:
 
 def kill_a_worker(run: psutil.Process, rng: np.random.Generator) -> bool:
     """Kill one worker process of a run, if there is one; nannies start it again."""
-    below = [one for one in run.children(recursive=True) if "spawn_main" in " ".join(one.cmdline())]
+    below = [process for process in run.children(recursive=True) if "spawn_main" in " ".join(process.cmdline())]
     if not below:
         return False
     below[rng.integers(len(below))].kill()
@@ -210,7 +210,7 @@ def test_a_worker_that_outlives_a_plan_takes_the_settings_of_the_next_one(
         results.prepare(plan)
         (calibration,), first = plan.calibrations, plan.captures[0]
         if solvers is None:
-            files = {name: Path(one.path).read_bytes() for (_, name), one in named_files(calibration)}
+            files = {name: Path(file.path).read_bytes() for (_, name), file in named_files(calibration)}
             calibrations = CalibrationFiles(tmp_path / "calibrations")
             calibrations.add(calibration.digest, files)
             solvers = Solvers(calibrations)

@@ -77,9 +77,9 @@ def solve_bare(plan_file: Path, root: Path, part: int, parts: int) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     plan, results = read_plan(plan_file), ResultFolder(root)
     calibrations = CalibrationFiles(root / f"calibrations-{part}")
-    for one in plan.calibrations:
-        pairs = zip(local_names(one), one.files, strict=True)
-        calibrations.add(one.digest, {name: Path(file.path).read_bytes() for (_, name), file in pairs})
+    for calibration in plan.calibrations:
+        pairs = zip(local_names(calibration), calibration.files, strict=True)
+        calibrations.add(calibration.digest, {name: Path(file.path).read_bytes() for (_, name), file in pairs})
     solvers = Solvers(calibrations)
     for capture in plan.captures[part::parts]:
         task = Task(capture, plan.calibration(capture.calibration), plan.settings, plan.software)
@@ -108,7 +108,7 @@ def bare(plan_file: Path, root: Path, processes: int) -> float:
 def workers_of(run: psutil.Process) -> list[psutil.Process]:
     """Return the worker processes of a run on one machine."""
     try:
-        return [one for one in run.children(recursive=True) if "spawn_main" in " ".join(one.cmdline())]
+        return [process for process in run.children(recursive=True) if "spawn_main" in " ".join(process.cmdline())]
     except psutil.NoSuchProcess:
         return []
 
@@ -120,14 +120,16 @@ def on_dask(plan_file: Path, root: Path, workers: int) -> tuple[float, list[floa
     with subprocess.Popen(command("run", plan_file, "-o", root, "--workers", workers), **quiet) as run:  # type: ignore[call-overload]
         while run.poll() is None:
             below = workers_of(psutil.Process(run.pid))
-            memory_mb.append(max((one.memory_info().rss / 1e6 for one in below if one.is_running()), default=0.0))
+            memory_mb.append(
+                max((process.memory_info().rss / 1e6 for process in below if process.is_running()), default=0.0)
+            )
             time.sleep(1)
     return time.monotonic() - begin_s, memory_mb
 
 
-def same_results(plan: Plan, one: Path, other: Path) -> bool:
+def same_results(plan: Plan, left: Path, right: Path) -> bool:
     """Return whether two folders have the same pictures and reports, byte by byte."""
-    first, second = ResultFolder(one), ResultFolder(other)
+    first, second = ResultFolder(left), ResultFolder(right)
     return all(
         (first.place(name) / file).read_bytes() == (second.place(name) / file).read_bytes()
         for name in (capture.result for capture in plan.captures)
@@ -140,11 +142,11 @@ def overhead_s(plan: Plan, root: Path, tasks: int = 2000) -> float:
     """Return the seconds of one task whose result is there already: submission, scheduling, transport."""
     results, first = ResultFolder(root), plan.captures[0]
     captures = tuple(first.model_copy(update={"result": f"{k:032x}"}) for k in range(tasks))
-    for one in captures:
-        results.place(one.result).mkdir(parents=True)
-        (results.place(one.result) / "report.json").touch()
+    for capture in captures:
+        results.place(capture.result).mkdir(parents=True)
+        (results.place(capture.result) / "report.json").touch()
     with cluster.connected(1, None) as client:
-        names = [one.result for one in captures]
+        names = [capture.result for capture in captures]
         begin_s = time.monotonic()
         count = sum(1 for _ in cluster.outcomes(client, plan.model_copy(update={"captures": captures}), names, root))
         return (time.monotonic() - begin_s) / count
@@ -188,9 +190,11 @@ def add_earlier_pictures(source: Path, folder: Path) -> None:
     on_dask(folder / "earlier.toml", folder / "earlier", 2)
     results = ResultFolder(folder / "earlier")
     (source / "before").mkdir()
-    for one in plan.captures:
-        if results.has(one.result):
-            (source / "before" / f"{Path(one.raw).stem}.tiff").symlink_to(results.place(one.result) / "picture.tiff")
+    for capture in plan.captures:
+        if results.has(capture.result):
+            (source / "before" / f"{Path(capture.raw).stem}.tiff").symlink_to(
+                results.place(capture.result) / "picture.tiff"
+            )
 
 
 def judge_quality(root: Path) -> None:

@@ -139,7 +139,7 @@ def measured(
     status_s, press_s = max(seen.status_s, default=TIMEOUT_S), max(seen.press_s, default=TIMEOUT_S)
     failed = opening.failed + seen.failed
     share = max(status_s / STATUS_S, press_s / PRESS_S, log_mb / LOG_MB_PER_MIN, 2.0 if failed else 0.0)
-    count = sum(len(one.status_s) + len(one.press_s) for one in (opening, seen))
+    count = sum(len(part.status_s) + len(part.press_s) for part in (opening, seen))
     cells = (str(count), str(len(failed)), max(opening.status_s), status_s, press_s, log_mb, *size)
     timing.row(name, *cells, limit=1.0, value=share)
     for reason in sorted(set(failed)):

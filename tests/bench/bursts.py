@@ -78,7 +78,7 @@ def frames(
     """Return a frame of each place, and the light of a still eye in one frame in electrons."""
     still = exposed(retina(plane, sensor), psf)
     scale = np.float32(peak_e / still.max())
-    lights = [exposed(retina(plane, sensor, one), psf) * scale for one in places]
+    lights = [exposed(retina(plane, sensor, place), psf) * scale for place in places]
     return [counted(light, sensor, seed + k) for k, light in enumerate(lights)], still * scale
 
 
@@ -138,11 +138,12 @@ def dim_bursts(folder: Path, names: Sequence[str] = SIX) -> None:
             scores.append(score(solved_burst(joined, shots[0], calibration)))
         true = score.truth_contrast
         shares = [
-            np.nan if true is None or one.vessel_contrast is None else one.vessel_contrast / true for one in scores
+            np.nan if true is None or result.vessel_contrast is None else result.vessel_contrast / true
+            for result in scores
         ]
-        cells = [*(one.pcc for one in scores), *shares]
+        cells = [*(result.pcc for result in scores), *shares]
         found.append(cells)
-        timing.row(name, *cells, registration_error(joined, places), str(sum(one.used for one in joined.frames)))
+        timing.row(name, *cells, registration_error(joined, places), str(sum(use.used for use in joined.frames)))
     timing.row("mean", *np.nanmean(found, axis=0))
 
 
@@ -152,7 +153,7 @@ def _vessels(file: Path, place: tuple[float, float, float]) -> Mask | None:
         "hrf": file.parents[1] / "manual1" / f"{file.stem}.tif",
         "chase": file.with_name(f"{file.stem}_1stHO.png"),
     }
-    path = next((one for name, one in drawn.items() if name in file.parts), None)
+    path = next((drawing for name, drawing in drawn.items() if name in file.parts), None)
     return None if path is None else retina(photograph(path, place, IMX296)[..., 1], IMX296) > 0.5
 
 
@@ -176,11 +177,11 @@ def displaced(folder: Path, names: Sequence[str] = SIX) -> None:
             gains.append(score(solved_burst(joined, shots[0], calibration)).psnr_db - one_db)
         shots, still_e = frames(plane, drift(40 + k), psf, 100 * k)
         bad = {2: counted(np.full_like(still_e, still_e.mean()), PAPER, 3), 5: _smeared(plane, psf)}
-        good = joiner([one for i, one in enumerate(shots) if i not in bad])
-        mixed = joiner([bad.get(i, one) for i, one in enumerate(shots)])
-        both = [score(solved_burst(one, shots[0], calibration)).psnr_db - one_db for one in (good, mixed)]
+        good = joiner([shot for i, shot in enumerate(shots) if i not in bad])
+        mixed = joiner([bad.get(i, shot) for i, shot in enumerate(shots)])
+        both = [score(solved_burst(burst, shots[0], calibration)).psnr_db - one_db for burst in (good, mixed)]
         rows.append([*gains, *both])
-        left_out = ", ".join(str(one.index) for one in mixed.frames if not one.used)
+        left_out = ", ".join(str(use.index) for use in mixed.frames if not use.used)
         timing.row(name, *gains, *both, left_out)
     timing.row("mean", *np.mean(rows, axis=0))
 
@@ -195,7 +196,7 @@ def _smeared(plane: Image, psf: Image) -> Counts:
 def registration_error(joined: JoinedFrame, places: Places) -> float:
     """Return the rms error of the shifts about their mean, px per axis."""
     errors = np.array(
-        [np.subtract(one.shift_px, places[one.index]) for one in joined.frames if one.shift_px is not None]
+        [np.subtract(use.shift_px, places[use.index]) for use in joined.frames if use.shift_px is not None]
     )
     return float(np.sqrt(((errors - errors.mean(axis=0)) ** 2).mean()))
 

@@ -88,6 +88,8 @@ def pictures(world: World, found: Calibration, truth: Calibration, planner: Plan
     rows, cols = (np.arange(size) - size // 2 for size in world.shape)
     inside = np.hypot(rows[:, None], cols) < 0.95 * field_radius_px(found)
     judge, recipes = PictureScorer(world.truth(colour), inside, 8.0), (Recipe("gradient", 1),)
-    made = (Reconstructor(one, world.shape, planner, VirtualClock(), recipes)(counts) for one in (found, truth))
-    by_found, by_truth = (judge(one.picture).psnr_db for one in made)
+    made = (
+        Reconstructor(candidate, world.shape, planner, VirtualClock(), recipes)(counts) for candidate in (found, truth)
+    )
+    by_found, by_truth = (judge(reconstruction.picture).psnr_db for reconstruction in made)
     return by_found, by_truth

@@ -82,13 +82,13 @@ def colours(folder: Path, names: Sequence[str] = tuple(FIELDS)) -> None:
         rows.append(_judge(name, made, planes, shifts, n))
     found = np.array(rows)
     timing.row("rms of the shifts, mean of the others", *_rms(found[:, :4]), *found[:, 4:].mean(axis=0))
-    held = np.array([not one.startswith(FITTED) for one in names])
+    held = np.array([not field_name.startswith(FITTED) for field_name in names])
     if held.any() and not held.all():
         timing.row("photographs that gave no coefficient", *_rms(found[held, :4]), *found[held, 4:].mean(axis=0))
 
 
 def _rms(values: NDArray[np.float64]) -> list[float]:
-    return [float(one) for one in np.sqrt((values**2).mean(axis=0))]
+    return [float(rms) for rms in np.sqrt((values**2).mean(axis=0))]
 
 
 def _judge(name: str, made: Pictures, planes: Image, shifts: dict[Colour, Shift], n: int) -> list[float]:
@@ -98,15 +98,15 @@ def _judge(name: str, made: Pictures, planes: Image, shifts: dict[Colour, Shift]
     own, _ = register_colours(truth, "green", lit, n)
     joined = join_colours(made, lit, n)
     without = join_colours({"red": made["red"], "green": made["green"]}, lit, n).picture
-    found = {one.name: one.shift_px or (0.0, 0.0) for one in joined.channels}
-    plain = {name: moved_back(one, np.ones_like(one), found[name])[0] for name, one in made.items()}
+    found = {channel.name: channel.shift_px or (0.0, 0.0) for channel in joined.channels}
+    plain = {name: moved_back(picture, np.ones_like(picture), found[name])[0] for name, picture in made.items()}
     db, errors = [], []
     for c in MOVED:
         score = scorer(truth[c])
-        db += [score(one).psnr_db for one in (plain[c], joined.picture[..., CHANNEL_PLANE[c]])]
+        db += [score(picture).psnr_db for picture in (plain[c], joined.picture[..., CHANNEL_PLANE[c]])]
         off = np.subtract(found[c], shifts[c])
         errors += [float(np.sqrt((off**2).mean())), float(np.sqrt(np.square(own[c]).mean()))]
-    differences = [_difference(one, truth, scored()) for one in (joined.picture, without)]
+    differences = [_difference(picture, truth, scored()) for picture in (joined.picture, without)]
     timing.row(name, *errors, *db, *differences, str(len(joined.doubtful)))
     return [*errors, *db, *differences]
 
@@ -118,5 +118,5 @@ def _difference(picture: Image, truth: Pictures, inside: NDArray[np.bool_]) -> f
         t, x = truth[c].astype(np.float64), picture[..., CHANNEL_PLANE[c]].astype(np.float64)
         ours.append(fit_intensity(x, t, inside)[inside][::EVERY])
         theirs.append(t[inside][::EVERY])
-    one, other = (np.clip(np.stack(values, axis=1), 0, 1) for values in (ours, theirs))
-    return float(ciede2000(lab(one), lab(other)).mean())
+    left, right = (np.clip(np.stack(values, axis=1), 0, 1) for values in (ours, theirs))
+    return float(ciede2000(lab(left), lab(right)).mean())

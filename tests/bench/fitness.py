@@ -60,15 +60,18 @@ def fitness(planner: Planner) -> None:
         seconds.append(clock.now_s() - begin_s)
     for light in LIGHTS:
         print(f"\n{light:.0%} of the light:")
-        _spread([one for one, by in statements if one is not None and by == light], len(statements) // len(LIGHTS))
+        _spread(
+            [statement for statement, by in statements if statement is not None and by == light],
+            len(statements) // len(LIGHTS),
+        )
     print(f"one capture takes {np.median(seconds):.2f} s of idle time at {shape[0]} x {shape[1]}")
     _changed_heads(make, psf_check)
     _darks()
     _waits(planner)
 
 
-def _sure(one: PsfMatchResult | None) -> PsfMatchResult | None:
-    return one if one is not None and one.sd <= MAX_SCORE_SD else None
+def _sure(statement: PsfMatchResult | None) -> PsfMatchResult | None:
+    return statement if statement is not None and statement.sd <= MAX_SCORE_SD else None
 
 
 def _spread(statements: list[PsfMatchResult], asked: int) -> None:
@@ -93,12 +96,12 @@ def _changed_heads(make: Reconstructor, psf_check: PsfMatchTest) -> None:
     judge = PictureScorer(changed_heads.world().truth("green"), inside, 8.0)
     print(f"\n{'misfit':<26} {'psf':>6} {'shift':>6} {'width':>7} {'PSNR, dB':>9}")
     for row in _rows():
-        one, made = psf_check(row.frame, dark()), make(row.frame, dark())
-        assert one is not None
+        statement, made = psf_check(row.frame, dark()), make(row.frame, dark())
+        assert statement is not None
         psnr_db = max(judge(np.roll(made.picture, by, 1)).psnr_db for by in range(-MOVED_PX, MOVED_PX + 1))
         print(
-            f"{row.name:<26} {one.upper_limit:6.2f} {np.hypot(*one.field_offset_deg):6.2f} "
-            f"{one.field_radius_change_ratio:+7.2%} {psnr_db:9.2f}"
+            f"{row.name:<26} {statement.upper_limit:6.2f} {np.hypot(*statement.field_offset_deg):6.2f} "
+            f"{statement.field_radius_change_ratio:+7.2%} {psnr_db:9.2f}"
         )
 
 
@@ -133,8 +136,9 @@ def _darks() -> None:
             for n in range(3)
         ]
         found = ", ".join(
-            f"{one.name} {one.value:.3g} {one.unit} {'ok' if one.ok else 'FAILS' if one.fails else 'hint'}"
-            for one in check(calibrated(), None, seen, (), NOW)
+            f"{finding.name} {finding.value:.3g} {finding.unit} "
+            f"{'ok' if finding.ok else 'FAILS' if finding.fails else 'hint'}"
+            for finding in check(calibrated(), None, seen, (), NOW)
         )
         print(f"black {black_dn:+g} DN, {hot:.2%} of the pixels hot: {found}")
 
@@ -151,6 +155,6 @@ def _waits(planner: Planner) -> None:
         moments_s = [clock.now_s()]
         assess_capture(calibration, None, witness, at, lambda into=moments_s: into.append(clock.now_s()))
         looks.append(np.diff([*moments_s, clock.now_s()]))
-    whole_s, longest_s, usual_s = (np.median([of(one) for one in looks]) for of in (np.sum, np.max, np.median))
+    whole_s, longest_s, usual_s = (np.median([of(look) for look in looks]) for of in (np.sum, np.max, np.median))
     waits = f"a press waits {1e3 * usual_s:.1f} ms, {1e3 * longest_s:.0f} at most"
     print(f"a capture of {world.shape}: {whole_s:.2f} s; {waits}")

@@ -177,12 +177,12 @@ def joined(folder: Path, pair: Pair, seed: int, px_per_deg: float | None) -> dic
 
 def common_error_px(found: Montage, pair: Pair, px_per_deg: float | None) -> float:
     """Return the rms distance of found and true places in the second picture, over the common part of both fields."""
-    one = found.placed[1]
-    if one.shift_px is None or one.rotation_deg is None:
+    place = found.placed[1]
+    if place.shift_px is None or place.rotation_deg is None:
         return float("nan")
     here = (np.indices((53, 53)).reshape(2, -1).T - 26.0) * FIELD_PX / 52
     true = place_in_second(here, np.array(pair.shift_px), pair.torsion_deg, px_per_deg)
-    product = place_in_second(here, np.array(one.shift_px), one.rotation_deg, found.px_per_deg)
+    product = place_in_second(here, np.array(place.shift_px), place.rotation_deg, found.px_per_deg)
     common = (np.linalg.norm(here, axis=1) < FIELD_PX / 2) & (np.linalg.norm(true, axis=1) < FIELD_PX / 2)
     return float(np.sqrt(np.mean(np.sum((product - true)[common] ** 2, axis=1))))
 
@@ -205,16 +205,16 @@ def same_eye(folder: Path, px_per_deg: float | None, stride: int) -> dict[Line, 
         if seed % stride:
             continue
         for projection, montage in joined(folder, pair, 2 * seed, px_per_deg).items():
-            one = montage.placed[1]
-            error_px = float(np.hypot(*np.subtract(one.shift_px or (np.nan, np.nan), pair.shift_px)))
+            place = montage.placed[1]
+            error_px = float(np.hypot(*np.subtract(place.shift_px or (np.nan, np.nan), pair.shift_px)))
             common_px = common_error_px(montage, pair, px_per_deg)
-            turn_deg = (np.nan if one.rotation_deg is None else one.rotation_deg) - pair.torsion_deg
+            turn_deg = (np.nan if place.rotation_deg is None else place.rotation_deg) - pair.torsion_deg
             line = projection, pair.overlap, abs(pair.torsion_deg)
-            found.setdefault(line, []).append((error_px, common_px, one.used))
+            found.setdefault(line, []).append((error_px, common_px, place.used))
             print(
                 f"{projection} {pair.photograph:6} overlap {pair.overlap:.2f} torsion {pair.torsion_deg:+.0f} used "
-                f"{one.used!s:5} error {error_px:5.2f} px, common {common_px:5.2f} px, {turn_deg:+.2f} deg, "
-                f"peak {one.peak:.2f}, overlap found {one.overlap:.2f}",
+                f"{place.used!s:5} error {error_px:5.2f} px, common {common_px:5.2f} px, {turn_deg:+.2f} deg, "
+                f"peak {place.peak:.2f}, overlap found {place.overlap:.2f}",
                 flush=True,
             )
     return found
@@ -227,9 +227,9 @@ def different_eyes(folder: Path) -> list[bool]:
     for seed, (a, b) in enumerate(list(combinations(PHOTOGRAPHS, 2))[:20]):
         steps = [np.array([random.uniform(-0.1, 0.1), random.uniform(-0.4, 0.4)]) * FIELD_PX for _ in range(2)]
         both = [picture(folder, name, step, 0.0, 900 + 2 * seed) for name, step in zip((a, b), steps, strict=True)]
-        one = make_montage(both).placed[1]
-        refused.append(not one.used)
-        print(f"{a:6} {b:6} used {one.used!s:5} peak {one.peak:.2f}, overlap {one.overlap:.2f}", flush=True)
+        place = make_montage(both).placed[1]
+        refused.append(not place.used)
+        print(f"{a:6} {b:6} used {place.used!s:5} peak {place.peak:.2f}, overlap {place.overlap:.2f}", flush=True)
     return refused
 
 
@@ -245,8 +245,8 @@ def main() -> None:
         raise SystemExit("say where the photographs are: DATA=folder, which holds fundus/")
     found, refused, failed = same_eye(folder, px_per_deg, asked.stride), different_eyes(folder), False
     for (projection, overlap, torsion_deg), pairs_there in found.items():
-        used = sum(one for _, _, one in pairs_there)
-        errors_px = np.array([one[:2] for one in pairs_there if one[2]]).reshape(-1, 2)
+        used = sum(is_used for _, _, is_used in pairs_there)
+        errors_px = np.array([pair[:2] for pair in pairs_there if pair[2]]).reshape(-1, 2)
         rms_px, common_px = np.sqrt(np.mean(errors_px**2, axis=0)) if used else (np.nan, np.nan)
         limit_px = 0.6 if overlap >= 0.44 else 1.5
         holds = used == 0 if overlap <= 0.15 else used == len(pairs_there) and rms_px <= limit_px

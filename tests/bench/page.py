@@ -92,7 +92,7 @@ def marks(page: Page) -> list[Mark]:
 
 def first(noted: list[Mark], name: str) -> float:
     """Return the time of the first mark with that name, in ms of the page's clock."""
-    return next(at_ms for one, at_ms, _ in noted if one == name)
+    return next(at_ms for mark_name, at_ms, _ in noted if mark_name == name)
 
 
 def pressed(page: Page) -> list[Mark] | None:

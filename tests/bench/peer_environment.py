@@ -43,7 +43,10 @@ def lensless_pictures(y: Image, psf: Image, rounds: tuple[int, ...]) -> list[tup
         return []
     with LenslessPeer(ENVIRONMENT, rounds, memory=True) as lensless:
         try:
-            return [(one.name, one.seconds * 1e3, one.peak_mb or 0.0, one.picture) for one in lensless(y, psf)]
+            return [
+                (result.name, result.seconds * 1e3, result.peak_mb or 0.0, result.picture)
+                for result in lensless(y, psf)
+            ]
         except SettingError as error:
             print(f"LenslessPiCam is left out: {error.message}")
             return []

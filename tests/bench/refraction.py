@@ -189,10 +189,10 @@ class Limits:
 
 def summarise(title: str, scored: list[Scored], k: int, limits: Limits) -> bool:
     """Print the figures of one component of one group beside its lines; return True if all hold."""
-    known = [one for one in scored if one.refused is None]
+    known = [result for result in scored if result.refused is None]
     error, sd = (
         np.array([values[k] for values in column])
-        for column in ([one.errors_dpt for one in known], [one.sds_dpt for one in known])
+        for column in ([result.errors_dpt for result in known], [result.sds_dpt for result in known])
     )
     z = np.abs(error / sd)
     rms, median_sd, refused = float(np.sqrt(np.mean(error**2))), float(np.median(sd)), 1 - len(known) / len(scored)
@@ -218,20 +218,23 @@ def summarise(title: str, scored: list[Scored], k: int, limits: Limits) -> bool:
 def tabulate(scored: list[Scored]) -> None:
     """Print a Markdown table of the error of M and its coverage by light, field edge and object of one group."""
     cells: dict[tuple[str, str], list[Scored]] = {}
-    for one in scored:
-        case = one.case
+    for result in scored:
+        case = result.case
         for key in (("light", f"{case.light:g}"), ("edge", case.edge_kind), ("object", case.photo)):
-            cells.setdefault(key, []).append(one)
+            cells.setdefault(key, []).append(result)
     print("| by | value | frames | refused | RMS M, dpt | below 1 sd | below 2 sd |\n|---|---|---|---|---|---|---|")
-    for (by, value), ones in sorted(cells.items()):
-        known = [one for one in ones if one.refused is None]
+    for (by, value), results in sorted(cells.items()):
+        known = [result for result in results if result.refused is None]
         error, sd = (
             np.array([column[0] for column in columns])
-            for columns in ([one.errors_dpt for one in known], [one.sds_dpt for one in known])
+            for columns in ([result.errors_dpt for result in known], [result.sds_dpt for result in known])
         )
         shares = [f"{np.mean(np.abs(error) < k * sd):.0%}" if known else "-" for k in (1, 2)]
         rms = f"{np.sqrt(np.mean(error**2)):.3f}" if known else "-"
-        print(f"| {by} | {value} | {len(ones)} | {len(ones) - len(known)} | {rms} | {' | '.join(shares)} |", flush=True)
+        print(
+            f"| {by} | {value} | {len(results)} | {len(results) - len(known)} | {rms} | {' | '.join(shares)} |",
+            flush=True,
+        )
 
 
 @dataclass(frozen=True)
@@ -332,11 +335,11 @@ def judge_faults(seed: int, count: int, data: Path) -> bool:
     """Print each frame that must be refused or carry its error; return True if the lines hold."""
     z: list[float] = []
     refused = 0
-    for kind, one in faults(seed, count, data):
-        refused += one.refused is not None
-        if one.refused is None:
-            z.append(abs(one.errors_dpt[0] / one.sds_dpt[0]))
-        print(f"{kind}: {one.line}", flush=True)
+    for kind, result in faults(seed, count, data):
+        refused += result.refused is not None
+        if result.refused is None:
+            z.append(abs(result.errors_dpt[0] / result.sds_dpt[0]))
+        print(f"{kind}: {result.line}", flush=True)
     beyond = [sum(value > limit for value in z) for limit in (3, 4)]
     holds = beyond[0] <= 1 and beyond[1] == 0
     print(
@@ -397,7 +400,8 @@ def judge_pictures(seed: int, data: Path) -> bool:
             found.setdefault((round(cylinder_dpt, 1), case.light), []).append(picture_gain(case, data))
         for (cylinder_dpt, light), pairs in found.items():
             measured, predicted = (
-                " ".join("   -" if one is None else f"{one:+.2f}" for one in part) for part in zip(*pairs, strict=True)
+                " ".join("   -" if gain_db is None else f"{gain_db:+.2f}" for gain_db in part)
+                for part in zip(*pairs, strict=True)
             )
             print(
                 f"{camera.bits} bit {field_deg:g} deg, cylinder {cylinder_dpt:+.0f} dpt, light {light:g}: gain "

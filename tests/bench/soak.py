@@ -43,7 +43,7 @@ class PipedBrowser:
 
     def ask(self, method: str, **words: Any) -> dict[str, Any]:
         """Attach to the page, send one command, detach, and return its answer."""
-        page = next(one for one in self._pages() if one["type"] == "page")
+        page = next(target for target in self._pages() if target["type"] == "page")
         session = self._say("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
         answer = self._say(method, session, **words)
         self._say("Target.detachFromTarget", sessionId=session)
@@ -56,7 +56,11 @@ class PipedBrowser:
     def own_mb(self) -> float:
         """Return the private dirty memory of the renderer processes."""
         processes = self._say("SystemInfo.getProcessInfo")["processInfo"]
-        sizes = [Path(f"/proc/{one['id']}/smaps_rollup").read_text() for one in processes if one["type"] == "renderer"]
+        sizes = [
+            Path(f"/proc/{process['id']}/smaps_rollup").read_text()
+            for process in processes
+            if process["type"] == "renderer"
+        ]
         return (
             sum(int(line.split()[1]) for text in sizes for line in text.splitlines() if "Private_Dirty" in line) / 1024
         )
@@ -89,8 +93,8 @@ class PipedBrowser:
             more = os.read(self._answers, 1 << 16)
             assert more, "the browser ended"
             self._heard += more
-        one, self._heard = self._heard.split(b"\0", 1)
-        message: dict[str, Any] = json.loads(one)
+        encoded, self._heard = self._heard.split(b"\0", 1)
+        message: dict[str, Any] = json.loads(encoded)
         return message
 
 

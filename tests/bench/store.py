@@ -87,7 +87,7 @@ def _every(server: Server) -> list[str]:
     """Return the ids of all captures, page by page."""
     ids, before = list[str](), ""
     while page := server.ask("GET", f"/api/captures?limit=100{before}")["captures"]:
-        ids += [one["id"] for one in page]
+        ids += [capture["id"] for capture in page]
         before = f"&before={ids[-1]}"
     return ids
 
@@ -98,13 +98,13 @@ def start_damaged(data: Path, head: Path, number: int) -> None:
     draw = random.Random(40)
     failed, missing = 0, 0
     with CaptureStore(data) as store:
-        stored = {one.id for one in store.captures(100_000)}
+        stored = {capture.id for capture in store.captures(100_000)}
     for turn in range(number):
-        one = planned[draw.randrange(len(planned))]
+        trial = planned[draw.randrange(len(planned))]
         folder = shutil.copytree(data, data.with_name(f"damaged-{turn}"))
-        if not (paths := targets(folder, one.target)):
+        if not (paths := targets(folder, trial.target)):
             paths = targets(folder, "database")
-        DAMAGES[one.damage](folder, paths, draw)
+        DAMAGES[trial.damage](folder, paths, draw)
         server = Server(head, folder, {})
         try:
             with server.running():

@@ -101,8 +101,8 @@ def dose(ago_s: float) -> Cause:
         real.clock.advance(ago_s)
 
         def end() -> None:
-            for one in given:
-                light.ledger.settle(one, 0.0)
+            for reservation in given:
+                light.ledger.settle(reservation, 0.0)
             real.clock.advance(RETRY_S)
 
         return end
@@ -229,7 +229,7 @@ class StandingAlerts:
         """Open the aiming screen of the instrument with this alert, and wait for the alert."""
         real = self.instrument(code)
         visits = real.visits() or [real.begin_visit(consent="agreed", sex="woman", age=54)]
-        visit = next((one["id"] for one in visits if not one["finished_at"]), None)
+        visit = next((candidate["id"] for candidate in visits if not candidate["finished_at"]), None)
         visit = visit or real.begin_visit(consent="agreed", sex="woman", age=54)["id"]
         page.goto(f"{real.url}/#/visit/{visit}/aim/R-centre")
         expect(page.locator(f"[data-code='{code}']")).to_have_count(1, timeout=SOON_MS)

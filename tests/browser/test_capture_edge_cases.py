@@ -167,7 +167,7 @@ def test_not_possible_is_set_and_undone_while_aiming(open_page: Open, real: Real
     assert look_for_faults(page, SHUTTER) == []
     tap(page, "#not-possible")
     reasons = page.locator("[data-reason]")
-    assert [one.get_attribute("data-reason") for one in reasons.all()][0::6] == ["lids", "other"]
+    assert [reason.get_attribute("data-reason") for reason in reasons.all()][0::6] == ["lids", "other"]
     assert look_for_faults(page) == []
     tap(page, "[data-reason=lids]")
     tile = page.locator("[data-slot='R-centre']")

@@ -120,7 +120,7 @@ def test_clock_jump_keeps_order_and_dose(open_page: Open, real: Real, to: dateti
     take_picture(page)
     second = real.rig.store.captures(1)[0]
     assert second.taken_at.date() == to.date() != first.taken_at.date()
-    assert [one.id for one in real.rig.store.captures(2)] == [second.id, first.id]
+    assert [capture.id for capture in real.rig.store.captures(2)] == [second.id, first.id]
     slot = page.evaluate(f"fetch('/api/visits/{visit_of(page)}').then((answer) => answer.json())")["slots"]["R-centre"]
     assert slot["captures"] == [first.id, second.id]
     assert ledger.spent_j_per_cm2("OD") > spent, "no date forgives a dose"

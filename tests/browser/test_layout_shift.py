@@ -179,7 +179,7 @@ def test_compared_pictures_are_labelled(open_page: Open, real: Real) -> None:
     visit = real.visit()
     first, second = visit["slots"]["R-centre"]["captures"]
     page.goto(f"{real.url}/#/visit/{visit['id']}/compare/{first}/{second}")
-    left, right = (page.locator(".two figcaption").nth(one) for one in (0, 1))
+    left, right = (page.locator(".two figcaption").nth(index) for index in (0, 1))
     for caption, name in ((left, "picture 1"), (right, "picture 2")):
         expect(caption).to_contain_text(f"Right eye · Centre, {name}")
         expect(caption).to_contain_text(":")  # the time of day

@@ -39,10 +39,10 @@ def test_home_links_to_upload_queue(open_page: Open, queue: Queue) -> None:
     expect(page.locator("#send")).to_have_text(re.compile(r"0 sent · 3 waiting"))
     tap(page, "#send")
     items = queue_items(page)
-    assert ["does not take it" in one for one in items] == [True, False, False]
-    assert ["tried again by itself" in one for one in items] == [False, True, False]
-    assert all(re.search(r"\d MB", one) for one in items)
-    assert ["1 try" in one for one in items] == [True, True, False]
+    assert ["does not take it" in item for item in items] == [True, False, False]
+    assert ["tried again by itself" in item for item in items] == [False, True, False]
+    assert all(re.search(r"\d MB", item) for item in items)
+    assert ["1 try" in item for item in items] == [True, True, False]
     expect(page.locator(".send [aria-live]")).to_contain_text("3 people wait to be sent.")
     expect(page.locator(".send [aria-live]")).to_contain_text("Next try in 1 minute.")
     queue.receiver.gate.clear()

@@ -102,7 +102,7 @@ def test_sentences_are_spoken_while_aiming(voices_page: Page) -> None:
     expect(voices_page.locator("dialog [data-say='say.still']")).to_contain_text(sentences("hi")["say.still"])
     voices_page.locator("dialog [data-say='say.still']").tap()
     expect(voices_page.locator("#sentence")).to_have_text(sentences("hi")["say.still"])
-    assert [(one["text"], one["lang"]) for one in voices_page.evaluate(SPOKEN)] == [
+    assert [(utterance["text"], utterance["lang"]) for utterance in voices_page.evaluate(SPOKEN)] == [
         (sentences("en")["say.centre"], "en-GB"),
         (sentences("en")["say.nerve"], "en-GB"),
         (sentences("hi")["say.still"], "hi-IN"),

@@ -109,7 +109,7 @@ def test_failed_check_is_announced_and_spoken(open_page: Open, technician_server
         spoken.append(
             {"text": f"{name.capitalize()}. {failed.remedy}".replace("Captures", "Pictures"), "lang": "en-GB"}
         )
-    assert [one for one in page.evaluate("spoken") if "lang" in one] == spoken
+    assert [utterance for utterance in page.evaluate("spoken") if "lang" in utterance] == spoken
     assert layout_faults(page, "li[data-ok=false]") == []
 
 

@@ -95,10 +95,10 @@ def test_both_renderers_draw_equal_pictures(bench: Page) -> None:
         const { PictureRenderer, drawn, maxDifference } = window.bench;
         const [gl, plain] = [new PictureRenderer(), new PictureRenderer(() => null)];
         const loupes = [null, { u: 0.02, v: 0.01, held: false }, { u: 0.1, v: -0.1, held: true }];
-        const worst = tools.map((one, i) => {
+        const worst = tools.map((tool, i) => {
             const scale = scales[i % scales.length];
             const loupe = loupes[i % loupes.length];
-            return maxDifference(drawn(gl, one, scale, loupe), drawn(plain, one, scale, loupe));
+            return maxDifference(drawn(gl, tool, scale, loupe), drawn(plain, tool, scale, loupe));
         });
         return [gl.renderer.name, plain.renderer.name, Math.max(...worst)];
     }""",
@@ -391,14 +391,14 @@ def test_loupe_pans_picture_at_edge(open_page: Open, real: Real) -> None:
 
 def test_compared_pictures_share_loupe(open_page: Open, real: Real) -> None:
     page = open_comparison(open_page, real)
-    one, other = page.locator(".two eye-pic").all()
+    left, right = page.locator(".two eye-pic").all()
     tap(page, "#loupe")
-    one.focus()
+    left.focus()
     page.keyboard.press("ArrowRight")
     page.keyboard.press("ArrowDown")
-    assert loupe_position(other) == loupe_position(one) != (0, 0)
+    assert loupe_position(right) == loupe_position(left) != (0, 0)
     page.keyboard.press("l")
-    expect(other).to_have_attribute("data-loupe", "")
+    expect(right).to_have_attribute("data-loupe", "")
     expect(page.locator("#loupe")).to_have_attribute("aria-pressed", "false")
 
 

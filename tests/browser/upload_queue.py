@@ -47,4 +47,4 @@ def waiting(real: Real) -> list[dict[str, Any]]:
 
 def has_tried(real: Real, count: int) -> bool:
     """Return whether the upload of `count` waiting visits was tried."""
-    return sum(one["tries"] > 0 for one in waiting(real)) == count
+    return sum(visit["tries"] > 0 for visit in waiting(real)) == count

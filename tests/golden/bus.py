@@ -58,8 +58,10 @@ class Listener:
         yield
         found = self._since()
         self.phases[name] = {
-            "spi": [f"{one['hz']} Hz, mode {one['mode']}: {shortened(one['hex'])}" for one in found["spi"]],
-            "i2c": [as_line(one) for one in found["i2c"]],
+            "spi": [
+                f"{message['hz']} Hz, mode {message['mode']}: {shortened(message['hex'])}" for message in found["spi"]
+            ],
+            "i2c": [as_line(message) for message in found["i2c"]],
         }
 
     def _since(self) -> dict[str, list[dict[str, Any]]]:

@@ -186,9 +186,9 @@ def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
     Measured numbers in `out` become placeholders.
     """
     if isinstance(value, dict):
-        return {name: _plain(one, normaliser, name) for name, one in value.items()}
+        return {name: _plain(entry, normaliser, name) for name, entry in value.items()}
     if isinstance(value, list):
-        return [_plain(one, normaliser, key) for one in value]
+        return [_plain(entry, normaliser, key) for entry in value]
     if not isinstance(value, str):
         return value
     if key == "call":
@@ -230,14 +230,14 @@ def parameters(command: Any) -> list[dict[str, Any]]:
     """Return the parameters of a command: names, type, limits, default, and whether it is required or repeated."""
     return [
         {
-            "names": [*one.opts, *one.secondary_opts],
-            "type": one.type_descriptor.annotation.__name__,
-            "limits": [one.min, one.max],
-            "default": None if one.default is None else str(one.default),
-            "required": one.required,
-            "repeated": one.multiple or one.nargs == -1,
+            "names": [*parameter.opts, *parameter.secondary_opts],
+            "type": parameter.type_descriptor.annotation.__name__,
+            "limits": [parameter.min, parameter.max],
+            "default": None if parameter.default is None else str(parameter.default),
+            "required": parameter.required,
+            "repeated": parameter.multiple or parameter.nargs == -1,
         }
-        for one in command.params
+        for parameter in command.params
     ]
 
 

@@ -31,7 +31,7 @@ def difference(recorded: Any, present: Any, tolerance: float = 0.0) -> str:
     Floating-point figures are equal if they differ by at most `tolerance` times the recorded one, or times 1.
     """
     present = _without_rounding(recorded, json.loads(json.dumps(present)), tolerance)
-    texts = [as_text(one).splitlines() for one in (recorded, present)]
+    texts = [as_text(value).splitlines() for value in (recorded, present)]
     lines = list(difflib.unified_diff(texts[0], texts[1], "recorded", "present", lineterm="", n=2))
     more = [f"... and {len(lines) - MAX_LINES} lines more"] if len(lines) > MAX_LINES else []
     return "\n".join(lines[:MAX_LINES] + more)
@@ -40,7 +40,7 @@ def difference(recorded: Any, present: Any, tolerance: float = 0.0) -> str:
 def _without_rounding(recorded: Any, present: Any, tolerance: float) -> Any:
     """Return `present` with the recorded figure wherever its own is equal within the tolerance."""
     if isinstance(recorded, dict) and isinstance(present, dict):
-        return {key: _without_rounding(recorded.get(key), one, tolerance) for key, one in present.items()}
+        return {key: _without_rounding(recorded.get(key), value, tolerance) for key, value in present.items()}
     if isinstance(recorded, list) and isinstance(present, list) and len(recorded) == len(present):
         return [_without_rounding(old, new, tolerance) for old, new in zip(recorded, present, strict=True)]
     if isinstance(recorded, float) and isinstance(present, float):
@@ -60,5 +60,5 @@ def _lines(value: Any, depth: int) -> list[str]:
             for key in sorted(value)
         ]
         return ["{\n", ",\n".join(inner), f"\n{end}}}"]
-    inner = [f"{pad}{''.join(_lines(one, depth + 1))}" for one in value]
+    inner = [f"{pad}{''.join(_lines(entry, depth + 1))}" for entry in value]
     return ["[\n", ",\n".join(inner), f"\n{end}]"]

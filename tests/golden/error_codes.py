@@ -39,7 +39,7 @@ def codes() -> list[str]:
         for node in nodes(text(name))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
-    return sorted(one for one in texts if CODE.fullmatch(one) and not FILE.fullmatch(one))
+    return sorted(literal for literal in texts if CODE.fullmatch(literal) and not FILE.fullmatch(literal))
 
 
 def _kinds(kind: type[DiffuscopeError]) -> Iterator[type[DiffuscopeError]]:

@@ -70,7 +70,7 @@ class ScriptedClock(GateClock):
 
     def at(self, moment_s: float, act: Callable[[], Any]) -> None:
         """Call `act` when the clock reaches `moment_s`."""
-        self._script = sorted([*self._script, (moment_s, act)], key=lambda one: one[0])
+        self._script = sorted([*self._script, (moment_s, act)], key=lambda entry: entry[0])
 
     @property
     def is_done(self) -> bool:
@@ -92,7 +92,7 @@ def without_figures(kind: str, data: dict[str, Any]) -> dict[str, Any]:
     """Return an event's data without estimated values: FFT plans may change their last digit."""
     match kind:
         case "calibration":
-            return {"findings": [{"name": one["name"], "ok": one["ok"]} for one in data["findings"]]}
+            return {"findings": [{"name": finding["name"], "ok": finding["ok"]} for finding in data["findings"]]}
         case "verdict":
             return data | {"numbers": sorted(data["numbers"])}
         case "aim":
@@ -174,7 +174,7 @@ class Stage:
     def settle(self) -> None:
         """Wait until all presses are answered and the exam is idle or has ended."""
         until(lambda: self.clock.is_done, PATIENCE_S)
-        for answer in [one for one in self.answers if hasattr(one, "exception")]:
+        for answer in [future for future in self.answers if hasattr(future, "exception")]:
             answer.exception(PATIENCE_S)
         if self.closing is not None:
             self.closing.join(PATIENCE_S)
@@ -322,8 +322,8 @@ def lamp_lost(stage: Stage) -> None:
 
 
 SCENARIOS: dict[str, Callable[[Stage], None]] = {
-    one.__name__: one
-    for one in (
+    scenario.__name__: scenario
+    for scenario in (
         press,
         press_while_aiming,
         aiming_ends,
@@ -391,13 +391,15 @@ def play(stage: Stage, name: str) -> dict[str, Any]:
     found = {
         "what": SCENARIOS[name].__doc__,
         "trace": stage.trace.entries,
-        "answers": [answered(one) for one in stage.answers],
+        "answers": [answered(answer) for answer in stage.answers],
         "after": {
             "state": rig.exam.state,
             "problem": None if rig.exam.problem is None else refusal(rig.exam.problem),
             "died": rig.died.is_set(),
             "lamp": "dark" if rig.world.illumination is None else "lit",
-            "captures": [[one.id, one.eye, one.simulated, sorted(one.files)] for one in rig.store.captures()],
+            "captures": [
+                [capture.id, capture.eye, capture.simulated, sorted(capture.files)] for capture in rig.store.captures()
+            ],
             "journal": sorted(path.name for path in (rig.store.folder / "journal").iterdir()),
             "spent_j_per_cm2": {
                 eye: float(f"{rig.exam.head.light.ledger.spent_j_per_cm2(eye):.6g}") for eye in ("OD", "OS")

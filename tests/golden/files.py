@@ -104,7 +104,11 @@ def _make_data(folder: Path) -> None:
             rig.store.folder / "accuracy", Path(place), clock, spec, lambda *_, **__: None, measure_scene
         ).choose("best")
         PinAuthenticator(rig.store.folder / "technician.json", clock).set_pin(PIN, None)
-        visit = next(one for one in rig.request("GET", "/api/visits").json()["visits"] if one["number"] == "B-7")
+        visit = next(
+            candidate
+            for candidate in rig.request("GET", "/api/visits").json()["visits"]
+            if candidate["number"] == "B-7"
+        )
         (folder / "export.zip").write_bytes(rig.request("GET", f"/api/visits/{visit['id']}/export.zip").content)
         rig.store.close()
         torn = rig.store.folder / "captures" / ".20260302T120600-OD-fedcba.part"
@@ -173,7 +177,7 @@ def read_data(folder: Path) -> dict[str, Any]:
             "store": _read_store(store),
             "visits": _read_visits(store, clock),
             "uploads": _read_uploads(store, clock),
-            "interrupted": [asdict(one) for one in CaptureJournal(store).interrupted],
+            "interrupted": [asdict(capture) for capture in CaptureJournal(store).interrupted],
             "spent_j_per_cm2": _read_doses(store),
         }
 
@@ -181,16 +185,16 @@ def read_data(folder: Path) -> dict[str, Any]:
 def _read_store(store: CaptureStore) -> dict[str, Any]:
     kept = [
         {
-            "id": one.id,
-            "eye": one.eye,
-            "taken_at": one.taken_at.isoformat(),
-            "simulated": one.simulated,
-            "calibration": one.calibration_id,
-            "report": one.report.as_json(),
-            "files": dict(one.files),
-            "sizes": {name: len(store.read(one.id, name)) for name in one.files},
+            "id": capture.id,
+            "eye": capture.eye,
+            "taken_at": capture.taken_at.isoformat(),
+            "simulated": capture.simulated,
+            "calibration": capture.calibration_id,
+            "report": capture.report.as_json(),
+            "files": dict(capture.files),
+            "sizes": {name: len(store.read(capture.id, name)) for name in capture.files},
         }
-        for one in store.captures()
+        for capture in store.captures()
     ]
     return {
         "captures": kept,
@@ -202,12 +206,12 @@ def _read_store(store: CaptureStore) -> dict[str, Any]:
 
 def _read_visits(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
     people = VisitRepository(store.engine, load_protocol(), clock)
-    visits = [visit_document(one, people.undo_until(one)).model_dump(mode="json") for one in people.visits(50)]
+    visits = [visit_document(visit, people.undo_until(visit)).model_dump(mode="json") for visit in people.visits(50)]
     exports = {}
-    for one in people.visits(50):
-        name = folder_name(one)
-        content = zip_archive(name, export_files(store, one, people.undo_until(one)), one.begun_at)
-        exports[one.number] = hashlib.sha256(content).hexdigest()
+    for visit in people.visits(50):
+        name = folder_name(visit)
+        content = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
+        exports[visit.number] = hashlib.sha256(content).hexdigest()
     return {"visits": visits, "counts": people.counts(), "damaged": people.damaged(), "exports": exports}
 
 
@@ -215,17 +219,17 @@ def _read_uploads(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
     queue = UploadQueue(store.engine, clock)
     waiting = [
         {
-            "visit": one.visit,
-            "number": one.number,
-            "finished_at": one.finished_at.isoformat(),
-            "tries": one.tries,
-            "failing_since": one.failing_since and one.failing_since.isoformat(),
-            "error": one.error,
-            "message": one.message,
-            "stuck": one.stuck,
-            "size_bytes": one.size_bytes,
+            "visit": entry.visit,
+            "number": entry.number,
+            "finished_at": entry.finished_at.isoformat(),
+            "tries": entry.tries,
+            "failing_since": entry.failing_since and entry.failing_since.isoformat(),
+            "error": entry.error,
+            "message": entry.message,
+            "stuck": entry.stuck,
+            "size_bytes": entry.size_bytes,
         }
-        for one in queue.queued(sizes=True)
+        for entry in queue.queued(sizes=True)
     ]
     trouble = queue.status()
     return {"waiting": waiting, "numbers": [trouble.waiting, trouble.stuck, trouble.failing]}
@@ -268,7 +272,7 @@ def _read_calibrations(folder: Path) -> dict[str, Any]:
             "made_by": kept.provenance.made_by,
             "made_at": kept.provenance.made_at.isoformat(),
             "temperature_c": kept.provenance.temperature_c,
-            "figures": [list(one) for one in kept.provenance.figures],
+            "figures": [list(figure) for figure in kept.provenance.figures],
             "field_deg": kept.calibration.field_deg,
             "black_dn": kept.calibration.sensor.black_dn,
             "pitch_um": kept.calibration.geometry.pitch_um,
@@ -297,7 +301,7 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
     write_state(place, read_state(folder / "update"))
     with CaptureStore(folder / "data", reserve_bytes=0, clock=clock) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
-        (visit,) = (one for one in people.visits(50) if one.number == "B-7")
+        (visit,) = (candidate for candidate in people.visits(50) if candidate.number == "B-7")
         name = folder_name(visit)
         zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
         lost = CaptureJournal(store).interrupted[0]
@@ -345,7 +349,7 @@ def _plain(column: str, value: Any) -> Any:
 
 def keys_of(value: Any) -> Any:
     """Return the keys of nested JSON, with the type of each value."""
-    return {key: keys_of(one) for key, one in value.items()} if isinstance(value, dict) else type(value).__name__
+    return {key: keys_of(entry) for key, entry in value.items()} if isinstance(value, dict) else type(value).__name__
 
 
 def numbered(value: Any) -> Any:

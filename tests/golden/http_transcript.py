@@ -374,7 +374,7 @@ def updates() -> list[dict[str, Any]]:
         device.board.updater("1.0").answer()
         found = log.ask("GET /api/update", note="what was found")["found"]
         log.ask("POST /api/update/install", json={"id": "two"})
-        (two,) = [one["id"] for one in found if one["name"] == "two.raucb"]
+        (two,) = [bundle["id"] for bundle in found if bundle["name"] == "two.raucb"]
         log.ask("POST /api/update/install", json={"id": two})
         log.ask("POST /api/update/check", note="another request waits")
         device.board.updater("1.0", restart=("true",)).answer()
@@ -476,8 +476,8 @@ def security() -> list[dict[str, Any]]:
 
 
 CHAPTERS: dict[str, Chapter] = {
-    one.__name__: one
-    for one in (captures, visits, exports, technician, calibration, updates, tablets, uploads, accuracy, security)
+    chapter.__name__: chapter
+    for chapter in (captures, visits, exports, technician, calibration, updates, tablets, uploads, accuracy, security)
 }
 
 

@@ -468,10 +468,10 @@ def run(only: Sequence[int] | None = None) -> int:
             verdict = tried(tree, MUTANTS[number - 1])
             if verdict != "killed":
                 survived.append(number)
-            one = MUTANTS[number - 1]
+            mutant = MUTANTS[number - 1]
             took_s = time.monotonic() - begin_s
             sys.stdout.write(
-                f"{number:3} {verdict:9} {took_s:5.1f} s  {one.file}  {one.old.strip()[:40]!r}  {one.test}\n"
+                f"{number:3} {verdict:9} {took_s:5.1f} s  {mutant.file}  {mutant.old.strip()[:40]!r}  {mutant.test}\n"
             )
             sys.stdout.flush()
     sys.stdout.write(f"{len(chosen) - len(survived)} of {len(chosen)} mutants killed\n")

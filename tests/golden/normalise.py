@@ -64,14 +64,14 @@ class Normaliser:
         if key in TIMED:
             return "<timed>"
         if isinstance(value, list | tuple):
-            return [self.json(one, key, measured) for one in value]
+            return [self.json(entry, key, measured) for entry in value]
         if isinstance(value, Mapping):
             if "unit" in value and "limit" in value:  # a finding about the calibration
                 value = value | {"value": "<number>"}
             if value.get("name") in OF_THE_COMPUTER and "limit" in value:
                 value = value | dict.fromkeys(("value", "known", "ok", "remedy"), "<of the computer>")
-            kept = {name: one for name, one in value.items() if not (measured and name in OF_THE_LOAD)}
-            return {self.text(str(name)): self.json(one, str(name), measured) for name, one in kept.items()}
+            kept = {name: entry for name, entry in value.items() if not (measured and name in OF_THE_LOAD)}
+            return {self.text(str(name)): self.json(entry, str(name), measured) for name, entry in kept.items()}
         if isinstance(value, bool) or value is None:
             return value
         return "<number>" if key in COUNTS or (measured and isinstance(value, float)) else value

@@ -55,7 +55,7 @@ def report(made: Reconstruction) -> dict[str, Any]:
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _rounded(one) for key, one in value.items()}
+        return {key: _rounded(entry) for key, entry in value.items()}
     if isinstance(value, float | np.floating):
         return float(f"{value:.5g}")
     return list(value) if isinstance(value, tuple) else value

@@ -35,7 +35,8 @@ def record(name: str) -> dict[str, Any]:
     }
     calibration = simulated_calibration(world(coarse(spec, K)))
     plan = {
-        one.name: {"simulated": one.simulated, "eta": float(f"{one.eta:.6g}"), "why": one.why} for one in scene.plan
+        effect.name: {"simulated": effect.simulated, "eta": float(f"{effect.eta:.6g}"), "why": effect.why}
+        for effect in scene.plan
     }
     seen = {key: figures(np.asarray(array)) for key, array in arrays.items()}
     return seen | {"calibration_psf": figures(calibration.psfs[0].pixels), "plan": plan}

@@ -21,7 +21,7 @@ def test_the_command_line_is_as_recorded(part: str, present: dict[str, Any]) -> 
 
 def test_every_command_is_called_well_or_badly() -> None:
     recorded = compare.read("command-line")
-    calls = [f"{one['call']} " for one in recorded["calls"]]
+    calls = [f"{call['call']} " for call in recorded["calls"]]
     names = list(recorded["commands"])
     leaves = [name for name in names if not any(other.startswith(f"{name} ") for other in names)]
     called = [name for name in leaves if any(call.startswith(f"{name} ") for call in calls)]

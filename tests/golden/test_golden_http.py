@@ -24,15 +24,15 @@ def interface(document: dict[str, Any]) -> Any:
 
     def bare(value: Any, is_mapping: bool = False) -> Any:
         if isinstance(value, list):
-            return [bare(one) for one in value]
+            return [bare(entry) for entry in value]
         if not isinstance(value, dict):
             return value
         if "$ref" in value:
             name = value["$ref"].removeprefix("#/components/schemas/")
             return bare(document["components"]["schemas"][name])
         return {
-            key: bare(one, is_mapping=key == "properties")
-            for key, one in value.items()
+            key: bare(entry, is_mapping=key == "properties")
+            for key, entry in value.items()
             if is_mapping or key not in PROSE
         }
 

@@ -59,9 +59,9 @@ class Transcript:
     def events(self, is_last: Callable[[dict[str, Any]], bool], after: int | None, note: str = "") -> None:
         """Record the server-sent events up to the first that `is_last`, without heartbeats after the first."""
         heard = self.instrument.follow(lambda events: any(map(is_last, events)), after)
-        last = next(number for number, one in enumerate(heard) if is_last(one))
-        kept = [one for number, one in enumerate(heard[: last + 1]) if number == 0 or one["event"] != "beat"]
-        body = [{key: self._event(key, one) for key in one} for one in kept]
+        last = next(number for number, event in enumerate(heard) if is_last(event))
+        kept = [event for number, event in enumerate(heard[: last + 1]) if number == 0 or event["event"] != "beat"]
+        body = [{key: self._event(key, event) for key in event} for event in kept]
         request = {"to": "GET /api/events", "headers": {} if after is None else {"Last-Event-ID": str(after)}}
         self._add("GET /api/events", note, request, {"status": 200, "events": body})
 

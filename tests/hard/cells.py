@@ -123,7 +123,7 @@ class CaseRunner:
         if case is CLEAN:
             self._clean[column] = picture
         inside = self._region(frame)
-        found, clean = (correlation(one, frame.simulated.truth, inside) for one in (picture, self._clean[column]))
+        found, clean = (correlation(image, frame.simulated.truth, inside) for image in (picture, self._clean[column]))
         eye = made.report.refraction_dpt
         sphere, sd = (None, None) if eye is None else (eye.get("sphere"), eye.get("sd"))
         assert not isinstance(sphere, str)

@@ -81,7 +81,7 @@ def write(folder: Path, found: HardCases) -> None:
     write_or_raise(folder, lambda: folder.mkdir(parents=True, exist_ok=True))
     whole = {
         "cells": [asdict(cell) | {"off_sd": cell.off_sd} for cell in found.cells],
-        "violations": [asdict(one) for one in found.violations],
+        "violations": [asdict(violation) for violation in found.violations],
     }
     pages = {"hard-cases.json": json.dumps(whole, indent=1) + "\n", "hard-cases.md": markdown(found)}
     pages |= {f"hard-cases-{k}.svg": found.picture(eye) for k, eye in enumerate(found.eyes, 1)}
@@ -114,5 +114,8 @@ def markdown(found: HardCases) -> str:
 
 def summary(found: HardCases) -> str:
     """Return one line per violation, and a line with the numbers of violations and cells."""
-    lines = [f"* {one.rule}: {one.eye}; {one.case}; {one.method}: {one.words}" for one in found.violations]
+    lines = [
+        f"* {violation.rule}: {violation.eye}; {violation.case}; {violation.method}: {violation.words}"
+        for violation in found.violations
+    ]
     return "\n".join([*lines, f"{len(found.violations)} violations in {len(found.cells)} cells"])

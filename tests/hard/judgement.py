@@ -83,7 +83,7 @@ def violations(cells: Sequence[Cell], cases: Mapping[str, Case] = NAMED) -> list
 def covered(cells: Sequence[Cell]) -> tuple[float, int]:
     """Return the share of default-schedule refractions within two standard deviations (0 if none), and their number."""
     off = [abs(cell.off_sd) for cell in cells if cell.method == DEFAULT_SCHEDULE and cell.off_sd is not None]
-    return sum(one <= COVERED_SIGMAS for one in off) / max(len(off), 1), len(off)
+    return sum(sigmas <= COVERED_SIGMAS for sigmas in off) / max(len(off), 1), len(off)
 
 
 def lost(cell: Cell) -> bool:

@@ -26,7 +26,7 @@ LEGEND = (
 def draw_grid(cells: Sequence[Cell], broken: Sequence[Violation], eye: str, columns: Sequence[str]) -> str:
     """Return the SVG of one eye's grid; colour: loss of PCC against the clean frame, red frame: violation."""
     mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
-    bad = {(one.case, one.method) for one in broken if one.eye == eye}
+    bad = {(violation.case, violation.method) for violation in broken if violation.eye == eye}
     inner, y, group = [], TOP, ""
     for case in CASES:
         if not any((case.key, column) in mine for column in columns):

@@ -269,7 +269,7 @@ class Disk:
                     return "write", at, data[: SECTOR_BYTES * draw.randint(0, len(data) // SECTOR_BYTES)]
             return change
 
-        alone = [partial(_alone, one) for one in waiting[-MAX_ALONE:]]
+        alone = [partial(_alone, change) for change in waiting[-MAX_ALONE:]]
         for way in (*ways, *alone, *[some] * draws):
             left: dict[str, bytes | None] = {}
             _collect(self._root, "", _together(way, waiting), left)
@@ -291,8 +291,8 @@ def _rename_on_fat(source: DiskEntry, target: DiskEntry, names: tuple[str, str],
     source.do("forget", names[0])
 
 
-def _alone(one: tuple[object, ...], thing: DiskEntry, change: tuple[object, ...]) -> tuple[object, ...] | None:
-    return change if change is one else None
+def _alone(survivor: tuple[object, ...], thing: DiskEntry, change: tuple[object, ...]) -> tuple[object, ...] | None:
+    return change if change is survivor else None
 
 
 def _together(way: Survives, waiting: list[tuple[object, ...]]) -> Survives:

@@ -86,7 +86,9 @@ def restore(folder: Path, acknowledge: Callable[[str], None]) -> None:
 def judge_restored(folder: Path, acknowledged: list[str]) -> str:
     """The store opens; it has all captures of the backup, or none and takes the backup then."""
     with CaptureStore(folder / "new", reserve_bytes=0) as store:
-        found = {one.id: {name: store.read(one.id, name) for name in one.files} for one in store.captures()}
+        found = {
+            capture.id: {name: store.read(capture.id, name) for name in capture.files} for capture in store.captures()
+        }
     assert found == {"before": FILES} or not (found or acknowledged)
     if not found:
         restore(folder, lambda word: None)

@@ -93,7 +93,7 @@ def keep(folder: Path, acknowledge: Callable[[str], None]) -> None:
 
 def judge_kept(folder: Path, acknowledged: list[str]) -> str:
     with CaptureStore(folder, reserve_bytes=0) as store:
-        listed = {one.id for one in store.captures()}
+        listed = {record.id for record in store.captures()}
         assert {*acknowledged, *(["before"] if (folder / "captures" / "before").exists() else [])} <= listed
         for id in listed:
             assert {name: store.read(id, name) for name in store.get(id).files} == FILES
@@ -227,7 +227,7 @@ def judge_migration(folder: Path, acknowledged: list[str]) -> str:
     assert version == SECOND or not acknowledged
     for _ in range(2):
         with CaptureStore(data, reserve_bytes=0) as store:
-            assert (store.recovery, [one.id for one in store.captures()]) == (RecoveryReport(), ["c1"])
+            assert (store.recovery, [record.id for record in store.captures()]) == (RecoveryReport(), ["c1"])
             assert {name: store.read("c1", name) for name in FILES} == FILES
         migrate_tables(folder, lambda word: None)
         assert len(list(data.glob("snapshots/*.db"))) == 1
@@ -264,7 +264,7 @@ def remove_and_undo(folder: Path, acknowledge: Callable[[str], None]) -> None:
 def judge_removed(folder: Path, acknowledged: list[str]) -> str:
     """Each file is there or known as removed, and all come back."""
     with CaptureStore(folder, reserve_bytes=0) as store:
-        assert [one.id for one in store.captures()] == ["before"]
+        assert [record.id for record in store.captures()] == ["before"]
         missing = set[str]()
         for name, content in FILES.items():
             try:
@@ -289,7 +289,7 @@ def judge_swept(folder: Path, acknowledged: list[str]) -> str:
         kept = [path.read_bytes() for path in (folder / "quarantine").glob("half*/raw.tiff")]
         assert kept
         assert set(kept) == {FILES["raw.tiff"]}
-        assert [one.id for one in store.captures()] == ["before"]
+        assert [record.id for record in store.captures()] == ["before"]
     return "new" if before else "old"
 
 
@@ -313,7 +313,7 @@ def judge_restored_snapshot(folder: Path, acknowledged: list[str]) -> str:
     found = in_tables(folder)
     assert found == ["c1"] or not acknowledged
     with CaptureStore(folder / "data", reserve_bytes=0) as store:
-        assert {one.id for one in store.captures()} == {"c1", "c2"}
+        assert {record.id for record in store.captures()} == {"c1", "c2"}
         assert [store.read(id, name) for id in ("c1", "c2") for name in FILES] == [*FILES.values()] * 2
     return "gone" if found is None else "new" if found == ["c1"] else "old"
 

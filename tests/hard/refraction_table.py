@@ -29,7 +29,7 @@ def rows(output: str) -> Iterator[str]:
         elif group := GROUP.match(line):
             name, frames, rms, within, near, refused = group.groups()
             yield f"| {name} | all | | {frames} | {refused} | {rms} | {near} | {within} |"
-            yield from (f"| {name} {one}" for one in found)
+            yield from (f"| {name} {row}" for row in found)
             found = []
 
 

@@ -249,9 +249,9 @@ def test_objects_that_differ_in_the_null_space_give_one_picture(method: str, wit
     noise = np.random.default_rng(9).normal(0, 20, SHAPE)
     plain, waved = (blurred(scene() + extra, image) + noise for extra in (0, wave))
     make = reconstructor_of(method, image)
-    one, other = (make(y.astype(np.float32)).picture.copy() for y in (plain, waved))
-    within(float(np.linalg.norm(one - other) / np.linalg.norm(wave)), 1e-3)
-    wave_share = abs(np.vdot(other, wave)) / np.vdot(wave, wave)
+    before, after = (make(y.astype(np.float32)).picture.copy() for y in (plain, waved))
+    within(float(np.linalg.norm(before - after) / np.linalg.norm(wave)), 1e-3)
+    wave_share = abs(np.vdot(after, wave)) / np.vdot(wave, wave)
     within(float(wave_share), 0.1)  # share of the wave, which is in the object and not in the frame
 
 

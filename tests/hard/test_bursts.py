@@ -69,9 +69,9 @@ def noise_dn(counts: Counts) -> Image:
 
 @pytest.mark.parametrize("count", [2, 4, 16])
 def test_copies_of_one_frame_join_to_that_frame(join: BurstJoiner, within: Within, count: int) -> None:
-    one = frame(seen(RETINA, (0, 0)), 5000, 1)
-    joined = join([one] * count)
-    linear = one.astype(np.float64) - BLACK_DN
+    shot = frame(seen(RETINA, (0, 0)), 5000, 1)
+    joined = join([shot] * count)
+    linear = shot.astype(np.float64) - BLACK_DN
     within(float(np.abs(joined.counts - linear).max() / linear.max()), (count + 2) * 2 * EPSILON)
     assert joined.light == pytest.approx(count)
 
@@ -80,8 +80,8 @@ def test_copies_of_one_frame_join_to_that_frame(join: BurstJoiner, within: Withi
 def test_the_noise_of_a_burst_is_that_of_the_mean(join: BurstJoiner, within: Within, places: list[Shift]) -> None:
     """Two bursts that differ by their noise only; both find the shifts to a hundredth of a pixel at this light."""
     first, second = ([frame(seen(RETINA, at), 20000, seed + k) for k, at in enumerate(places)] for seed in (10, 50))
-    joined = [join(one) for one in (first, second)]
-    assert all(use.used for one in joined for use in one.frames)
+    joined = [join(burst) for burst in (first, second)]
+    assert all(use.used for burst in joined for use in burst.frames)
     difference = (joined[0].counts - joined[1].counts)[INNER]
     expected = noise_dn(first[0])[INNER] * np.sqrt(2 / len(places))
     # 1 by theory; the shifts of the two bursts differ too, and quantisation adds a twelfth of a squared count.
@@ -121,10 +121,10 @@ def test_a_useless_frame_changes_nothing(join: BurstJoiner, within: Within, spoi
     within(_relative(mixed, alone), 10 * EPSILON)
 
 
-def _relative(one: JoinedFrame, other: JoinedFrame) -> float:
+def _relative(left: JoinedFrame, right: JoinedFrame) -> float:
     """Return the largest difference of two joined frames over the largest value."""
-    assert np.array_equal(np.isfinite(one.counts), np.isfinite(other.counts))
-    return float(np.nanmax(np.abs(one.counts - other.counts)) / np.nanmax(np.abs(other.counts)))
+    assert np.array_equal(np.isfinite(left.counts), np.isfinite(right.counts))
+    return float(np.nanmax(np.abs(left.counts - right.counts)) / np.nanmax(np.abs(right.counts)))
 
 
 @pytest.mark.parametrize("far_px", [0.0, 7.0, 30.0, 60.0])
@@ -136,7 +136,7 @@ def test_colours_that_far_apart_are_brought_together(within: Within, far_px: flo
     noise = np.random.default_rng(4).normal(0, 0.02, SHAPE).astype(np.float32)
     red = (0.5 + 0.5 * moved) * field() * shading * 4 + noise
     joined = join_colours({"green": green, "red": red}, field(), 1)
-    (found,) = (one.shift_px for one in joined.channels if one.name == "red")
+    (found,) = (channel.shift_px for channel in joined.channels if channel.name == "red")
     assert joined.doubtful == ()
     assert found is not None
     within(float(np.abs(np.subtract(found, shift)).max()), 0.3)
@@ -149,7 +149,7 @@ def test_a_colour_of_another_eye_is_not_moved_and_the_picture_says_so() -> None:
     other = np.asarray(np.rot90(RETINA, 2), np.float32)
     joined = join_colours({"green": seen(RETINA, (0, 0)), "red": seen(other, (0, 0))}, field(), 1)
     assert joined.doubtful == ("red",)
-    (red,) = (one for one in joined.channels if one.name == "red")
+    (red,) = (channel for channel in joined.channels if channel.name == "red")
     assert red.shift_px == (0.0, 0.0)
 
 
@@ -166,15 +166,15 @@ def test_a_split_press_of_a_moving_simulated_eye_is_nearer_to_the_truth(tmp_path
             split = choose_split(4, spec.camera.exposure_s, speed, PressLight(200 / spec.camera.exposure_s, 0.0))
             clock.sleep(60)  # the guard asks for darkness
             press = expose_press(head, ("OD",), clock, count=4, split=split)
-            *_, made = pipeline.bursts.steps([one.counts for one in press.lit], simulated=True)
+            *_, made = pipeline.bursts.steps([shot.counts for shot in press.lit], simulated=True)
             assert isinstance(made, Reconstruction)
-            assert all(one.used for one in made.report.frames)
+            assert all(use.used for use in made.report.frames)
             corrected_db.append(_psnr_db(made.picture, spec))
             doses.append(press.dose_j_per_cm2)
             splits.append(split)
     finally:
         head.close()
-    assert [one.parts for one in splits] == [1, 2]
+    assert [choice.parts for choice in splits] == [1, 2]
     assert doses[1] == pytest.approx(doses[0])
     gain_db = corrected_db[1] - corrected_db[0]
     assert gain_db == pytest.approx(splits[1].gain_db, abs=3 * MIN_GAIN_DB), "three times the largest error of the fit"

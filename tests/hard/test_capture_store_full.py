@@ -107,9 +107,11 @@ def on_a_small_disk(folder: Path) -> dict[str, Any]:
         for blocks in count():
             fill(ballast, leave_bytes=blocks * BLOCK_BYTES)
             outcome = attempt(store, f"c{blocks}", FILES)
-            tidy = {path.name for path in (folder / "store/captures").iterdir()} == {one.id for one in store.captures()}
+            tidy = {path.name for path in (folder / "store/captures").iterdir()} == {
+                record.id for record in store.captures()
+            }
             attempts.append({"blocks": blocks, "outcome": outcome, "tidy": tidy, "whole": is_complete(store)})
-            if [one["outcome"] for one in attempts[-3:]] == ["kept"] * 3:
+            if [trial["outcome"] for trial in attempts[-3:]] == ["kept"] * 3:
                 break
         fill(ballast, leave_bytes=0)
         opened = open_when_full(folder / "store", len(store.captures()))

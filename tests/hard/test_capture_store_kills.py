@@ -124,7 +124,7 @@ def test_each_step_is_durable_before_the_next_begins(tmp_path: Path) -> None:
     assert seen[4:7] == ["fsync .new.part", "rename", "fsync captures"]
     assert seen[7:10] == ["BEGIN IMMEDIATE", "INSERT INTO captures", "INSERT INTO files"]
     assert seen[10].startswith("UPDATE captures SET revision")
-    assert all(one.startswith("SELECT") for one in seen[11:]), "the search for unsigned records"
+    assert all(statement.startswith("SELECT") for statement in seen[11:]), "the search for unsigned records"
 
 
 # Victim process

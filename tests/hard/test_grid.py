@@ -53,7 +53,9 @@ def test_a_hard_case_keeps_its_bound_or_is_reported(
 ) -> None:
     cells = clean + grid.cells(NAMED[key])
     record_property("lost", str(cells[-1].lost))
-    assert not [f"{one.rule}: {one.words}" for one in violations(cells) if one.rule != "coverage"]
+    assert not [
+        f"{violation.rule}: {violation.words}" for violation in violations(cells) if violation.rule != "coverage"
+    ]
 
 
 def test_the_grid_and_the_command_give_the_same_picture(grid: CaseRunner, clean: list[Cell], tmp_path: Path) -> None:
@@ -92,7 +94,7 @@ OTHER = replace(GOOD, case="motion 0.5 deg")
 )
 def test_each_kind_of_violation_is_detected(rule: str, cell: Cell) -> None:
     assert not violations([GOOD, OTHER])
-    assert rule in [one.rule for one in violations([GOOD, cell])]
+    assert rule in [violation.rule for violation in violations([GOOD, cell])]
 
 
 def test_a_refusal_and_a_reported_loss_are_no_violations() -> None:

@@ -49,9 +49,9 @@ def test_a_power_cut_at_any_call_leaves_the_old_or_the_new_state_complete(name: 
             continue
         acknowledged = [word for word in disk.output.partition(f"<{name}>\n")[2].partition("<")[0].split("\n") if word]
         for left in disk.cuts(random_source):
-            if (one := hash((tuple(left.items()), len(acknowledged)))) in disks:
+            if (disk_hash := hash((tuple(left.items()), len(acknowledged)))) in disks:
                 continue
-            disks.add(one)
+            disks.add(disk_hash)
             with TemporaryDirectory(dir=recording.folder) as place:
                 found = (content(write_tree(left, Path(place) / "looked-at")), len(acknowledged))
                 if hash(found) not in contents:

@@ -49,7 +49,7 @@ def reconstructed(root: Path, capture: Capture, *frames: str) -> tuple[Any, Any]
     made.mkdir(exist_ok=True)
     words = [
         "reconstruct",
-        *(str(place / one) if one.endswith(".tiff") else one for one in frames),
+        *(str(place / word) if word.endswith(".tiff") else word for word in frames),
         "--dark",
         str(place / "dark.tiff"),
         "--calibration",
@@ -69,7 +69,7 @@ def test_a_burst_has_the_residual_and_the_picture_of_its_press(pressed: tuple[Pa
     stored, place = capture.report, root / "store" / "captures" / capture.id
     names = burst_of(capture)
     picture, report = reconstructed(root, capture, *names)
-    assert [one["used"] for one in report["frames"]] == [one.used for one in stored.frames]
+    assert [use["used"] for use in report["frames"]] == [use.used for use in stored.frames]
     for again, before in zip(report["frames"], stored.frames, strict=True):
         assert again["shift_px"] == pytest.approx(before.shift_px, abs=1e-3)
     # The press may stop a few rounds earlier, at its deadline.
@@ -87,13 +87,13 @@ def test_a_colour_press_is_repeated_with_its_calibration(pressed: tuple[Path, Ca
     picture, report = reconstructed(root, capture, *channels, "--channel", "red", "raw-red.tiff")
     assert report["residual"] == pytest.approx(stored.residual, rel=0.02)
     assert stated_mark(root / "again" / "picture.npy") is True
-    of_press = {one.name: one for one in stored.channels}
-    assert {one["name"] for one in report["channels"]} == of_press.keys() == {"green", "red", "blue"}
-    for one in report["channels"]:
-        before = of_press[one["name"]]
-        assert one["predicted"] == before.predicted
+    of_press = {channel.name: channel for channel in stored.channels}
+    assert {channel["name"] for channel in report["channels"]} == of_press.keys() == {"green", "red", "blue"}
+    for channel in report["channels"]:
+        before = of_press[channel["name"]]
+        assert channel["predicted"] == before.predicted
         if before.shift_px is not None:
-            assert one["shift_px"] == pytest.approx(before.shift_px, abs=0.02)
+            assert channel["shift_px"] == pytest.approx(before.shift_px, abs=0.02)
     shown = read_png((place / "colour.png").read_bytes())
     assert likeness(picture, shown) > 0.99  # 8 bits, and not linear
 
@@ -114,9 +114,10 @@ def likeness(picture: Any, shown: Any) -> float:
 def test_a_burst_and_one_of_its_frames_are_in_the_same_dn(pressed: tuple[Path, Capture]) -> None:
     root, capture = pressed
     burst, of_burst = reconstructed(root, capture, *burst_of(capture))
-    one, of_one = reconstructed(root, capture, "raw.tiff")
+    single, of_single = reconstructed(root, capture, "raw.tiff")
     used = sum(use["used"] for use in of_burst["frames"])
     assert used > 1
-    assert burst.mean() == pytest.approx(one.mean(), rel=0.02)  # light that pointed beyond the field moves with the eye
-    assert of_burst["quality"]["mean_dn"] == pytest.approx(of_one["quality"]["mean_dn"], rel=0.01)
-    assert of_burst["noise_dn"] == pytest.approx(of_one["noise_dn"] / used**0.5, rel=0.1)
+    # Light that pointed beyond the field moves with the eye.
+    assert burst.mean() == pytest.approx(single.mean(), rel=0.02)
+    assert of_burst["quality"]["mean_dn"] == pytest.approx(of_single["quality"]["mean_dn"], rel=0.01)
+    assert of_burst["noise_dn"] == pytest.approx(of_single["noise_dn"] / used**0.5, rel=0.1)

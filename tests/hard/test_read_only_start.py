@@ -93,11 +93,11 @@ def seen(client: httpx.Client) -> dict[str, Any]:
     captures = client.get("/api/captures?limit=100").json()["captures"]
     visits = client.get("/api/visits").json()["visits"]
     files = {
-        (one["id"], name): client.get(f"/api/captures/{one['id']}/{name}").content
-        for one in captures
+        (capture["id"], name): client.get(f"/api/captures/{capture['id']}/{name}").content
+        for capture in captures
         for name in ("picture.png", "raw.tiff")
     }
-    exports = {one["id"]: client.get(f"/api/visits/{one['id']}/export.zip").status_code for one in visits}
+    exports = {visit["id"]: client.get(f"/api/visits/{visit['id']}/export.zip").status_code for visit in visits}
     return {"captures": captures, "visits": visits, "files": files, "exports": exports}
 
 
@@ -121,7 +121,7 @@ def test_the_program_starts_for_reading_on_a_disk_that_takes_no_changes(
         assert client.get("/api/preview?after=0&eye=OD", headers={"X-Controller": "a" * 16}).status_code == 204
         status = client.get("/api/status").json()
         assert (status["problem"]["code"], status["space_left"]) == (CODES[case], 0)
-        failed = {one["name"] for one in client.get("/api/health").json()["checks"] if not one["ok"]}
+        failed = {check["name"] for check in client.get("/api/health").json()["checks"] if not check["ok"]}
         assert failed >= {"camera", "space"}
         # Beside the reserve, which was released, records can be written: a visit that is under way can be finished.
         begun = client.post("/api/visits", json={"key": "0123456789abcdef"}, headers={"X-Controller": "a" * 16})

@@ -31,9 +31,9 @@ def run_all(folder: Path, trials: int) -> list[Trial]:
 @pytest.mark.timeout(900)  # a quarter of an hour, for 1,250 openings beside other tests
 def test_no_damage_of_one_file_is_silent(tmp_path: Path) -> None:
     trials = run_all(tmp_path, TRIALS)
-    assert not [one for one in trials if one.violations]
-    assert sum(one.damage == "bit" for one in trials) >= FLIPS
-    assert sum(one.damage != "bit" for one in trials) >= OTHERS
+    assert not [trial for trial in trials if trial.violations]
+    assert sum(trial.damage == "bit" for trial in trials) >= FLIPS
+    assert sum(trial.damage != "bit" for trial in trials) >= OTHERS
 
 
 if __name__ == "__main__":

@@ -103,8 +103,8 @@ def _bright(point: Image) -> np.ndarray:
     return np.asarray(point > 0.02 * point.max())
 
 
-def _correlation(one: Image, other: Image) -> float:
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+def _correlation(left: Image, right: Image) -> float:
+    return float(np.corrcoef(left.ravel(), right.ravel())[0, 1])
 
 
 def run_walk(bench: Bench) -> Outcome:

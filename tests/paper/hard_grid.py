@@ -36,7 +36,7 @@ def run_grid(bench: Bench) -> Outcome:
         "message": f"of {frames} frames, those with a false message",
         "quality": f"of {losses} losses above .05, those with a better quality figure",
     }
-    count = {rule: sum(one.rule == rule for one in found.violations) for rule in rules}
+    count = {rule: sum(violation.rule == rule for violation in found.violations) for rule in rules}
     claims = (
         *(
             below(words, count[rule], 1, digits=0)
@@ -52,7 +52,10 @@ def run_grid(bench: Bench) -> Outcome:
     why = _unsaid(unsaid, found.cells)
     broken = Table(
         ("rule", "eye", "case", "method", "what is seen"),
-        tuple((one.rule, one.eye, one.case, one.method, one.words) for one in found.violations),
+        tuple(
+            (violation.rule, violation.eye, violation.case, violation.method, violation.words)
+            for violation in found.violations
+        ),
     )
     note = (
         f"{MERGED} x {MERGED} pixels are merged here, and only the default schedule (`ladder` in table and pictures) "

@@ -77,7 +77,7 @@ def run_lenslets(bench: Bench) -> Outcome:
     """Solve the same eyes behind the diffuser, a square array and aperiodic lenslets; then one of 4 dioptres."""
     found = {kind: [trial(bench, kind, seed) for seed in SEEDS] for kind in KINDS}
     strained = {kind: trial(bench, kind, SEEDS[0], MYOPIA_DPT) for kind in ("diffuser", "lenslets")}
-    passed = {kind: _means([one.passed for one in trials]) for kind, trials in found.items()}
+    passed = {kind: _means([result.passed for result in trials]) for kind, trials in found.items()}
     gains = {kind: _gains(found[kind], found["diffuser"]) for kind in KINDS[1:]}
     kept = strained["lenslets"].scores[0] - strained["diffuser"].scores[0]
     claims = (
@@ -115,7 +115,7 @@ def _passes(kind: str, passed: dict[str, list[float]]) -> Claim:
 
 def _gains(trials: Sequence[Trial], references: Sequence[Trial]) -> list[float]:
     """Return the difference of the PCC of each trial from that of its reference, the same eye."""
-    return [one.scores[0] - reference.scores[0] for one, reference in zip(trials, references, strict=True)]
+    return [result.scores[0] - reference.scores[0] for result, reference in zip(trials, references, strict=True)]
 
 
 def _means(values: Sequence[tuple[float, ...]]) -> list[float]:
@@ -125,7 +125,7 @@ def _means(values: Sequence[tuple[float, ...]]) -> list[float]:
 def _table(found: dict[str, list[Trial]], passed: dict[str, list[float]]) -> Table:
     rows = []
     for kind, trials in found.items():
-        scores = np.array([one.scores for one in trials])
+        scores = np.array([result.scores for result in trials])
         mean, spread = scores.mean(axis=0), scores.std(axis=0, ddof=1)
         rows.append(
             (
@@ -144,10 +144,10 @@ def _shown(found: dict[str, list[Trial]]) -> list[Figure]:
     first = {kind: trials[0] for kind, trials in found.items()}
     take = first["diffuser"].take
     figures = [replace(plane("truth", take.truth, take.inside), begins=True)]
-    for kind, one in first.items():
-        pcc, psnr_db, _ = one.scores
-        figures.append(plane(f"{NAMES[kind]}: PCC {pcc:.3f}, PSNR {psnr_db:.1f} dB", one.picture, take.inside))
-    psfs = [plane(f"PSF, {NAMES[kind]}", np.sqrt(_middle(one.take)), None) for kind, one in first.items()]
+    for kind, result in first.items():
+        pcc, psnr_db, _ = result.scores
+        figures.append(plane(f"{NAMES[kind]}: PCC {pcc:.3f}, PSNR {psnr_db:.1f} dB", result.picture, take.inside))
+    psfs = [plane(f"PSF, {NAMES[kind]}", np.sqrt(_middle(result.take)), None) for kind, result in first.items()]
     return [*figures, replace(psfs[0], begins=True), *psfs[1:]]
 
 
@@ -164,7 +164,7 @@ def _notes(gains: dict[str, list[float]], strained: dict[str, Trial]) -> tuple[s
     answer = (
         f"better than the diffuser in every eye: {', '.join(better)}" if better else "none does better in every eye"
     )
-    pitch_um, eye = DiffuserSpec().pitch_um, {kind: f"{one.scores[0]:.3f}" for kind, one in strained.items()}
+    pitch_um, eye = DiffuserSpec().pitch_um, {kind: f"{result.scores[0]:.3f}" for kind, result in strained.items()}
     return (
         f"Does one do better at the light of a real eye? In this simulation: {answer}. A lens of {pitch_um:g} um "
         "gathers the light of a point into one spot, so detail keeps about one over the root of their number; the "

@@ -108,10 +108,14 @@ def run_light(bench: Bench) -> Outcome:
     """Solve one eye with each head at the eye's own light and in bright light."""
     found = head_pictures(bench, shipped_heads())
     weak, strong = found[WEAK], found[STRONG]
-    contrasts = [_contrast(one.take, one.human) for one in (weak, strong)]
+    contrasts = [_contrast(pictures.take, pictures.human) for pictures in (weak, strong)]
     claims: list[Claim] = [
-        above(f"PCC, {one.light.short_name}", one.take.score(one.human).pcc, round(SEEN_PCC[name] - SLACK, 3))
-        for name, one in found.items()
+        above(
+            f"PCC, {pictures.light.short_name}",
+            pictures.take.score(pictures.human).pcc,
+            round(SEEN_PCC[name] - SLACK, 3),
+        )
+        for name, pictures in found.items()
     ]
     claims.append(
         above(
@@ -121,7 +125,7 @@ def run_light(bench: Bench) -> Outcome:
             digits=2,
         ).limit_from("five times the light cannot show less")
     )
-    shown = [figure for one in found.values() for figure in _row(one)]
+    shown = [figure for pictures in found.values() for figure in _row(pictures)]
     first, second = weak.light.mean_e, strong.light.mean_e
     words = (
         f"truth; bright light; a human eye: {weak.light.short_name} ({first:.0f} e- a pixel), "
@@ -131,7 +135,7 @@ def run_light(bench: Bench) -> Outcome:
     shown.append(side_by_side(words, FILE, [(tile, weak.take.inside) for tile in tiles]))
     heads = "a human eye: " + ", ".join(f"{x.light.short_name} ({x.light.mean_e:.0f} e-)" for x in found.values())
     same_field = {STRONG: weak.take.inside}  # of the same sensor, without the penumbra around it: one scale for all
-    fields = [(one.human, same_field.get(name, one.take.inside)) for name, one in found.items()]
+    fields = [(pictures.human, same_field.get(name, pictures.take.inside)) for name, pictures in found.items()]
     shown.append(side_by_side(heads, HEADS_FILE, fields))
     return Outcome(tuple(claims), tuple(shown), (_table(found),), (NOTE,))
 
@@ -142,10 +146,13 @@ def _contrast(take: SimulatedFrame, picture: Image) -> float:
     return contrast
 
 
-def _row(one: HeadPictures) -> list[Figure]:
+def _row(pictures: HeadPictures) -> list[Figure]:
     """Return the row of pictures of one head: truth, bright light, the eye's own light."""
-    name, take, inside = one.light.short_name, one.take, one.take.inside
-    lights = {"bright light": one.bright, f"a human eye's light, {one.light.mean_e:.0f} e- a pixel": one.human}
+    name, take, inside = pictures.light.short_name, pictures.take, pictures.take.inside
+    lights = {
+        "bright light": pictures.bright,
+        f"a human eye's light, {pictures.light.mean_e:.0f} e- a pixel": pictures.human,
+    }
     figures = [replace(plane(f"{name}: truth", take.truth, inside), begins=True)]
     for words, picture in lights.items():
         caption = f"{name}: {words}: PCC {take.score(picture).pcc:.3f}, vessel contrast {_contrast(take, picture):.3f}"
@@ -155,8 +162,8 @@ def _row(one: HeadPictures) -> list[Figure]:
 
 def _table(found: dict[str, HeadPictures]) -> Table:
     rows = []
-    for one in found.values():
-        light, take, contrast = one.light, one.take, one.take.judge.truth_contrast
+    for pictures in found.values():
+        light, take, contrast = pictures.light, pictures.take, pictures.take.judge.truth_contrast
         assert contrast is not None
         rows.append(
             (
@@ -164,8 +171,8 @@ def _table(found: dict[str, HeadPictures]) -> Table:
                 f"{light.mean_e:.0f}",
                 f"{light.peak_e:.0f}",
                 f"{1000 * light.exposure_s:g}",
-                *(f"{take.score(picture).pcc:.3f}" for picture in (one.human, one.bright)),
-                *(f"{_contrast(take, picture):.3f}" for picture in (one.human, one.bright)),
+                *(f"{take.score(picture).pcc:.3f}" for picture in (pictures.human, pictures.bright)),
+                *(f"{_contrast(take, picture):.3f}" for picture in (pictures.human, pictures.bright)),
                 f"{contrast:.3f}",
             )
         )

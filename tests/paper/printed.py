@@ -195,9 +195,9 @@ def run_prints(bench: Bench) -> Outcome:
     for name, right_deg in POSITIONS.items():
         bench.progress(f"S4: a printed retina, {name}")
         found[name] = print_at(bench, right_deg)
-    asked, same = _sum(one.edges for one in found.values())
-    faint, faint_same = _sum(one.faint for one in found.values())
-    spots, seen = _sum(one.spots for one in found.values())
+    asked, same = _sum(position.edges for position in found.values())
+    faint, faint_same = _sum(position.faint for position in found.values())
+    spots, seen = _sum(position.spots for position in found.values())
     off = [misregistration(found, name) for name in ("left", "right")]
     claims = (
         above("edges on nine cutlines with the truth's sign, share", same / max(asked, 1), 0.999, CAPTURED).limit_from(
@@ -217,10 +217,10 @@ def run_prints(bench: Bench) -> Outcome:
     rows = tuple(
         (
             name,
-            *(f"{one.take.score(x).pcc:.3f}" for x in (one.paper, one.flat)),
-            *(f"{got}/{of}" for of, got in (one.edges, one.spots)),
+            *(f"{position.take.score(x).pcc:.3f}" for x in (position.paper, position.flat)),
+            *(f"{got}/{of}" for of, got in (position.edges, position.spots)),
         )
-        for name, one in found.items()
+        for name, position in found.items()
     )
     sheet = Table(("position", "PCC, paper's solver", "PCC, flat-sub", "edges followed", "spots followed"), rows)
     return Outcome(claims, _shown(found), (sheet,), (MOVED_NOTE, _clear_edges(faint, faint_same)))
@@ -228,10 +228,10 @@ def run_prints(bench: Bench) -> Outcome:
 
 def _shown(found: dict[str, Position]) -> tuple[Figure, ...]:
     shown: list[Figure] = []
-    for name, one in found.items():
-        both = {"paper's solver": one.paper, "flat-sub": one.flat}
-        shown += compared(one.take, both, name)
-        shown.append(cutline(one.take, 0.0, both, f"Across vessels, {name}"))
+    for name, position in found.items():
+        both = {"paper's solver": position.paper, "flat-sub": position.flat}
+        shown += compared(position.take, both, name)
+        shown.append(cutline(position.take, 0.0, both, f"Across vessels, {name}"))
     return tuple(shown)
 
 

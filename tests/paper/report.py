@@ -135,7 +135,7 @@ def _write_pictures(folder: Path, outcome: Outcome) -> None:
 
 def all_hold(ran: Sequence[ExperimentRun]) -> bool:
     """Return whether every assertion of every experiment holds; what is not reproduced is no assertion."""
-    return all(claim.status != "does not hold" for one in ran for claim in one.outcome.claims)
+    return all(claim.status != "does not hold" for run in ran for claim in run.outcome.claims)
 
 
 def summary(claims: Sequence[Claim]) -> str:
@@ -163,11 +163,11 @@ def on_the_paper(claims: Sequence[Claim]) -> str:
 def table(ran: Sequence[ExperimentRun]) -> str:
     """Return a text table of every claim: experiment, mark, claim, value, limit, value in the paper."""
     lines = [f"{'':5}{'':4}{'assertion':<62}{'value':>10}  {'limit':<18}paper"]
-    for one in ran:
-        for claim in one.outcome.claims:
+    for run in ran:
+        for claim in run.outcome.claims:
             mark = MARKS[claim.status]
             lines.append(
-                f"{one.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
+                f"{run.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
                 f"{claim.paper}".rstrip()
             )
     return "\n".join(lines)
@@ -175,13 +175,13 @@ def table(ran: Sequence[ExperimentRun]) -> str:
 
 def html(ran: Sequence[ExperimentRun], merged: int) -> str:
     """Return the self-contained HTML report."""
-    every, total_s = [claim for one in ran for claim in one.outcome.claims], sum(one.seconds for one in ran)
+    every, total_s = [claim for run in ran for claim in run.outcome.claims], sum(run.seconds for run in ran)
     size = "Full size, 1080 x 1920" if merged == 1 else f"{merged} x {merged} pixels of the sensor merged to one"
     verdict = summary(every) + ("." if all(claim.holds for claim in every) else ". These are marked.")
     toc = "".join(
-        f'<li><a href="#{one.experiment.key}">{one.experiment.key}</a> {escape(one.experiment.title)}'
-        f"{_flags(one.outcome.claims)}</li>"
-        for one in ran
+        f'<li><a href="#{run.experiment.key}">{run.experiment.key}</a> {escape(run.experiment.title)}'
+        f"{_flags(run.outcome.claims)}</li>"
+        for run in ran
     )
     return "\n".join(
         [
@@ -197,14 +197,14 @@ def html(ran: Sequence[ExperimentRun], merged: int) -> str:
             CLAIMED,
             GLOSSARY,
             f"<h2>Contents</h2><ul class=toc>{toc}</ul>",
-            *(_section(one) for one in ran),
+            *(_section(run) for run in ran),
             "</main></html>\n",
         ]
     )
 
 
-def _section(one: ExperimentRun) -> str:
-    experiment, outcome = one.experiment, one.outcome
+def _section(run: ExperimentRun) -> str:
+    experiment, outcome = run.experiment, run.outcome
     pictures = "".join(_figure(shown) for shown in outcome.shown if not shown.wide)
     plots = "".join(_figure(shown) for shown in outcome.shown if shown.wide)
     return "\n".join(
@@ -216,7 +216,7 @@ def _section(one: ExperimentRun) -> str:
             f"<div class=pictures>{pictures}</div>" if pictures else "",
             f"<div class=plots>{plots}</div>" if plots else "",
             *(f"<p class=note>{escape(note)}</p>" for note in outcome.notes),
-            f"<p class=quiet>{one.seconds:.1f} s</p></section>",
+            f"<p class=quiet>{run.seconds:.1f} s</p></section>",
         ]
     )
 

@@ -74,15 +74,15 @@ def run_rules(bench: Bench) -> Outcome:
     every = [compare_rules(bench, name) for name in SCENES]
     rows = tuple(
         (
-            one.scene,
-            f"{one.best_mu:.0e}",
-            f"{one.best_db:.2f}",
-            f"{one.validated_db:.2f}",
-            f"{one.flat_first_db:.2f}",
-            f"{one.gradient_db:.2f}",
-            f"{one.gain_db:.1f}",
+            result.scene,
+            f"{result.best_mu:.0e}",
+            f"{result.best_db:.2f}",
+            f"{result.validated_db:.2f}",
+            f"{result.flat_first_db:.2f}",
+            f"{result.gradient_db:.2f}",
+            f"{result.gain_db:.1f}",
         )
-        for one in every
+        for result in every
     )
     head = (
         "scene",

@@ -195,8 +195,8 @@ def run_dots(bench: Bench) -> Outcome:
 
 def _printed_scores(before: Scores, after: Scores, swept: list[Cell]) -> tuple[Claim, ...]:
     """Return the claims on SSIM before and after flat-field correction, the only scores that the paper prints."""
-    best = max(one.after.ssim - one.before.ssim for one in swept)
-    bare = next(one for one in swept if one.mu == DOT_MU and one.floor == 0.0)
+    best = max(cell.after.ssim - cell.before.ssim for cell in swept)
+    bare = next(cell for cell in swept if cell.mu == DOT_MU and cell.floor == 0.0)
     near = "the paper's value +- 0.1"
     return (
         attempted("SSIM of the direct picture", before.ssim, 0.49, 0.69, ".59")
@@ -219,15 +219,15 @@ def _printed_scores(before: Scores, after: Scores, swept: list[Cell]) -> tuple[C
 
 def _rise(swept: list[Cell], score: str) -> float:
     """Return the rise of a score at DOT_MU with the floor before and after the division."""
-    chosen = next(one for one in swept if one.mu == DOT_MU and one.floor == FLOOR)
+    chosen = next(cell for cell in swept if cell.mu == DOT_MU and cell.floor == FLOOR)
     return float(getattr(chosen.after, score) - getattr(chosen.before, score))
 
 
 def _swept(settings: list[Cell]) -> Table:
     """Return a table of SSIM before and after the division: a row per weight, a column per floor."""
     rows = []
-    for mu in dict.fromkeys(one.mu for one in settings):
-        pairs = (f"{one.before.ssim:.3f} to {one.after.ssim:.3f}" for one in settings if one.mu == mu)
+    for mu in dict.fromkeys(cell.mu for cell in settings):
+        pairs = (f"{cell.before.ssim:.3f} to {cell.after.ssim:.3f}" for cell in settings if cell.mu == mu)
         rows.append((f"{mu:.0e}", *pairs))
     return Table(("mu", *(f"SSIM, floor {floor:.0%}" for floor in FLOORS)), tuple(rows))
 

@@ -115,7 +115,10 @@ def run_refraction(bench: Bench) -> Outcome:
         ),
     )
     rows = tuple(
-        (*(f"{value:+.2f}" for value in eye), *(" ".join(f"{value:+.2f}" for value in one) for one in estimates))
+        (
+            *(f"{value:+.2f}" for value in eye),
+            *(" ".join(f"{value:+.2f}" for value in estimate) for estimate in estimates),
+        )
         for eye, *estimates in zip(eyes, *found.values(), strict=True)
     )
     note = (

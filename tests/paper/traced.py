@@ -61,7 +61,9 @@ class Built(NamedTuple):
 
 def within_tolerances(path: LightPath) -> Built:
     """Return the 2.5 and 97.5 percentiles over DRAWS relays with random deviations."""
-    drawn = np.array([(one.filled_to_deg(), one.lit_share(30, count=1000)) for one in built_relays(path, DRAWS, SEED)])
+    drawn = np.array(
+        [(relay.filled_to_deg(), relay.lit_share(30, count=1000)) for relay in built_relays(path, DRAWS, SEED)]
+    )
     low, high = np.round(np.percentile(drawn, [2.5, 97.5], axis=0), 3)
     return Built((float(low[0]), float(high[0])), (float(low[1]), float(high[1])))
 

@@ -36,12 +36,12 @@ IRIS_PX = 317  # half of the iris in pixels of the paper: the part of a PSF that
 NEAR_DEG, MARGIN = 12.0, 0.05  # region in which the scales of two pictures are compared
 
 
-def magnification(one: Image, other: Image, take: SimulatedFrame) -> float:
-    """Return the size of `one` relative to `other` (1: equal), where the correlation of their details is highest."""
+def magnification(left: Image, right: Image, take: SimulatedFrame) -> float:
+    """Return the size of `left` relative to `right` (1: equal), where the correlation of their details is highest."""
     reach = round(NEAR_DEG * take.px_per_deg)
-    part = tuple(slice(n // 2 - reach, n - n // 2 + reach) for n in other.shape)  # same centre in both
+    part = tuple(slice(n // 2 - reach, n - n // 2 + reach) for n in right.shape)  # same centre in both
     details = []
-    for picture in (one, other):
+    for picture in (left, right):
         fine = highpass(picture.astype(np.float64)[part], take.inside[part], DETAIL_DEG * take.px_per_deg)
         details.append(ndimage.gaussian_filter(fine, 1.5))
     middle = (np.array(details[0].shape) - 1) / 2

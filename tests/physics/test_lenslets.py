@@ -15,7 +15,7 @@ ARRAY = DiffuserSpec(kind="microlenses", pitch_um=400.0)
 RANDOM = DiffuserSpec(kind="lenslets", pitch_um=400.0)
 
 
-@pytest.mark.parametrize("element", [ARRAY, RANDOM], ids=lambda one: one.kind)
+@pytest.mark.parametrize("element", [ARRAY, RANDOM], ids=lambda element: element.kind)
 def test_path_is_the_parabola_around_the_nearest_centre(element: DiffuserSpec) -> None:
     grid = grid_for(OPTICS, PITCH_UM, element=element)
     path = element_path_um(OPTICS, grid, 3, element)

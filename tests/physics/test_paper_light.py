@@ -55,10 +55,12 @@ def test_readme_has_the_gain_of_gradient_under_both_rules_for_mu() -> None:
         r"it is ([\d.]+) to ([\d.]+) dB nearer to the truth, by cross-validation for both ([\d.]+) to ([\d.]+) dB",
     )
     found = [compare_rules(Bench(), name) for name in RULED]
-    best = [one.gain_db for one in found]
-    validated = [one.gradient_db - one.validated_db for one in found]
+    best = [result.gain_db for result in found]
+    validated = [result.gradient_db - result.validated_db for result in found]
     assert printed == pytest.approx((min(best), max(best), min(validated), max(validated)), abs=0.051)
-    assert all(one.flat_first_db - one.validated_db > one.gain_db / 2 for one in found), "README: most of that"
+    assert all(result.flat_first_db - result.validated_db > result.gain_db / 2 for result in found), (
+        "README: most of that"
+    )
 
 
 def test_readme_has_the_ssim_of_the_dots() -> None:

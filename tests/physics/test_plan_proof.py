@@ -116,7 +116,7 @@ def test_all_skipped_effects_together_change_no_picture(proof: Proof, record_pro
 
 def seen_by_itself(proof: Proof, name: str) -> float:
     """Return the measured eta of one effect in addition to the plan."""
-    spec, chosen = proof.planned.spec, [one.name for one in proof.planned.plan if one.simulated]
+    spec, chosen = proof.planned.spec, [effect.name for effect in proof.planned.plan if effect.simulated]
     without = expected_electrons(proof.planned)
     added = world(spec, only=[*chosen, name])
     if name != "source":
@@ -135,15 +135,15 @@ def dot_eta(proof: Proof, dotted: Image, point: Image) -> float:
 
 
 def test_each_skipped_effect_is_below_a_twentieth_of_the_noise(proof: Proof, record_property) -> None:
-    small = [one for one in proof.planned.plan if not one.simulated and one.eta > 0]
+    small = [effect for effect in proof.planned.plan if not effect.simulated and effect.eta > 0]
     assert small, "at least the LED's bandwidth is never exactly nothing"
     together = proof.filter.eta(expected_electrons(proof.everything), expected_electrons(proof.planned))
     record_property("together", f"{together:.4f}")
-    alone = {one.name: seen_by_itself(proof, one.name) if len(small) > 1 else together for one in small}
-    for one in small:
-        record_property(one.name, f"{one.eta:.4f} {alone[one.name]:.4f}")
-        assert alone[one.name] < ETA_THRESHOLD, one
-        assert alone[one.name] < one.eta + ROUNDING, f"the formula of {one.name} is no bound"
+    alone = {effect.name: seen_by_itself(proof, effect.name) if len(small) > 1 else together for effect in small}
+    for effect in small:
+        record_property(effect.name, f"{effect.eta:.4f} {alone[effect.name]:.4f}")
+        assert alone[effect.name] < ETA_THRESHOLD, effect
+        assert alone[effect.name] < effect.eta + ROUNDING, f"the formula of {effect.name} is no bound"
     assert together < sum(alone.values()) + ROUNDING, "an effect of size zero is not nothing"
 
 
@@ -180,7 +180,7 @@ def plain(request: pytest.FixtureRequest) -> Proof:
 def test_eta_formula_is_a_tight_upper_bound_near_the_threshold(plain: Proof, name: str, record_property) -> None:
     spec = with_keys(plain.planned.spec, **NEAR[name])
     near = replace(plain, planned=world(spec, only=["shot", "read", "quantisation"]))
-    predicted = next(one.eta for one in world(spec).plan if one.name == name)
+    predicted = next(effect.eta for effect in world(spec).plan if effect.name == name)
     measured = seen_by_itself(near, name)
     record_property(name, f"{predicted:.4f} {measured:.4f}")
     assert 0 < measured < predicted + ROUNDING
@@ -206,8 +206,8 @@ def test_skipped_effects_are_sized_once_and_never_applied() -> None:
     calls: Counter[str] = Counter()
     of = world(coarse(load_head(SCENES / "calm.toml"), 4), effects=[Counted(effect, calls) for effect in EFFECTS])
     expected_electrons(of)
-    assert calls == {f"size {one.name}": 1 for one in of.plan} | {
-        f"apply {one.name}": 1 for one in of.plan if one.simulated
+    assert calls == {f"size {effect.name}": 1 for effect in of.plan} | {
+        f"apply {effect.name}": 1 for effect in of.plan if effect.simulated
     }
 
 

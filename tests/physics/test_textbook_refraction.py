@@ -56,7 +56,9 @@ def test_the_textbook_caustic_agrees_with_the_warp_and_its_signs() -> None:
     """
     eye = Prescription(-3.5, -1.0, 20.0)
     j0_dpt, j45_dpt = 0.5 * np.cos(np.deg2rad(40)), 0.5 * np.sin(np.deg2rad(40))
-    stored, strained = (Psf(caustic(OPTICS, SURFACE, one).astype(np.float32)) for one in (Prescription(), eye))
+    stored, strained = (
+        Psf(caustic(OPTICS, SURFACE, prescription).astype(np.float32)) for prescription in (Prescription(), eye)
+    )
     found = warped(stored, transform(GEOMETRY, 4.0, -j0_dpt, j45_dpt))
     assert np.corrcoef(found.pixels.ravel(), strained.pixels.ravel())[0, 1] > 0.998
     mirrored = warped(stored, transform(GEOMETRY, 4.0, -j0_dpt, -j45_dpt))

@@ -29,7 +29,7 @@ PATH = load_light_path(Path(__file__).parents[2] / "hardware" / "optics.toml")
 RELAY = traced_relay(PATH)
 LENSES = sorted(PATH.lens)
 D_UM = 0.5875618
-WITHOUT_RIMS = tuple(replace(one, clear_mm=inf) for one in RELAY.surfaces)
+WITHOUT_RIMS = tuple(replace(surface, clear_mm=inf) for surface in RELAY.surfaces)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_the_reversed_ray_returns_to_its_start(angle_deg: float, turn_deg: float
 @settings(max_examples=40)
 def test_etendue_is_conserved(angle_deg: float, height_mm: float) -> None:
     """Energy: the map of height and sine of the angle in the meridional plane keeps areas (Liouville), to 1e-6."""
-    lenses = tuple(replace(one, clear_mm=inf) for one in RELAY.lamp_surfaces)
+    lenses = tuple(replace(surface, clear_mm=inf) for surface in RELAY.lamp_surfaces)
 
     def mapped(height: float, sine: float) -> np.ndarray:
         direction = np.array([0, sine, sqrt(1 - sine**2)])

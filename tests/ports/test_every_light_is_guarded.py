@@ -126,9 +126,9 @@ def command_names() -> set[str]:
     """Return every command of the command line by its words."""
 
     def below(group: Any, words: str) -> Iterator[str]:
-        for name, one in subcommands(group):
-            if subcommands(one):
-                yield from below(one, f"{words}{name} ")
+        for name, command in subcommands(group):
+            if subcommands(command):
+                yield from below(command, f"{words}{name} ")
             else:
                 yield f"{words}{name}"
 
@@ -178,7 +178,7 @@ class Heads:
             self.result = CliRunner().invoke(app, [*name.split(), *given], input=typed)
             assert "Usage:" not in self.result.output
         assert not emulated_buses().lit
-        return [one for one in emulated_buses().messages[before:] if one["lit"]]
+        return [message for message in emulated_buses().messages[before:] if message["lit"]]
 
     def _until_lit(self, words: list[str], before: int) -> None:
         """Run a command as a process, and kill it once the ring has been lit: its computations are not needed."""
@@ -186,7 +186,9 @@ class Heads:
             [*MAIN, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         ) as process:
             wait_until(
-                lambda: process.poll() is not None or any(one["lit"] for one in emulated_buses().messages[before:])
+                lambda: (
+                    process.poll() is not None or any(message["lit"] for message in emulated_buses().messages[before:])
+                )
             )
             process.kill()
         wait_until(lambda: not emulated_buses().lit)
@@ -201,13 +203,13 @@ def heads(tmp_path_factory: pytest.TempPathFactory) -> Heads:
     return made
 
 
-@pytest.mark.parametrize("command", LIT, ids=lambda one: one[0])
+@pytest.mark.parametrize("command", LIT, ids=lambda words: words[0])
 def test_a_command_lights_the_ring_within_the_guard_only(heads: Heads, command: Words) -> None:
     assert heads.run(heads.usual, *command)
     assert heads.run(heads.too_bright, *command) == []
 
 
-@pytest.mark.parametrize("command", DARK[1:], ids=lambda one: one[0])
+@pytest.mark.parametrize("command", DARK[1:], ids=lambda words: words[0])
 def test_a_command_without_light_leaves_the_ring_dark(heads: Heads, command: Words) -> None:
     assert heads.run(heads.usual, *command) == []
 
@@ -241,7 +243,7 @@ class Server:
         """Return method and path of every endpoint; that which ends the login is the last one."""
         paths = self.ask("GET", "/api/openapi.json").json()["paths"]
         found = [(method.upper(), path) for path, methods in paths.items() for method in methods]
-        return sorted(found, key=lambda one: one[1] == "/api/technician/lock")
+        return sorted(found, key=lambda operation: operation[1] == "/api/technician/lock")
 
     def lenses(self) -> dict[str, Any]:
         found: dict[str, Any] = self.ask("GET", "/api/calibration").json()
@@ -281,4 +283,4 @@ def test_no_endpoint_lights_the_ring_past_the_guard(server: Server) -> None:
         tried.add(f"{method} {path}")
     assert tried >= LIT_ENDPOINTS
     assert len(tried) >= ENDPOINTS
-    assert not [one for one in emulated_buses().messages[before:] if one["lit"]]
+    assert not [message for message in emulated_buses().messages[before:] if message["lit"]]

@@ -82,9 +82,9 @@ def dark_after_s(chain: EmulatedBuses, moment_s: float) -> float:
     """Return the time from a moment to the message that turned the last LED off; the ring must then stay off."""
     time.sleep(0.5)
     assert not chain.lit
-    later = [one["at_s"] for one in chain.messages if one["at_s"] > moment_s]
-    lit = [one["at_s"] for one in chain.messages if one["lit"]]
-    before = [one for one in chain.messages if one["at_s"] <= moment_s]
+    later = [message["at_s"] for message in chain.messages if message["at_s"] > moment_s]
+    lit = [message["at_s"] for message in chain.messages if message["lit"]]
+    before = [message for message in chain.messages if message["at_s"] <= moment_s]
     if not before[-1]["lit"] and (not lit or lit[-1] <= moment_s):
         return 0.0
     return min(at_s for at_s in later if at_s > max(lit)) - moment_s
@@ -97,7 +97,8 @@ def test_killing_the_instrument_in_use_leaves_no_light(tmp_path, sound_wires, se
         seen = len(sound_wires.messages)
         user = Thread(target=instrument.use)
         user.start()
-        instrument.wait_until(lambda: any(one["lit"] for one in sound_wires.messages[seen:]))  # slow on a busy machine
+        # Slow on a busy machine.
+        instrument.wait_until(lambda: any(message["lit"] for message in sound_wires.messages[seen:]))
         time.sleep(random.Random(seed).uniform(0.2, 1.2))
         process.kill()
         died_s = time.monotonic()
@@ -105,5 +106,5 @@ def test_killing_the_instrument_in_use_leaves_no_light(tmp_path, sound_wires, se
         user.join()
         after_s = dark_after_s(sound_wires, died_s)
         limit_s = sleeper.dark_limit_s(died_s, died_s + after_s)
-    assert any(one["lit"] for one in sound_wires.messages[seen:])
+    assert any(message["lit"] for message in sound_wires.messages[seen:])
     assert after_s <= limit_s

@@ -218,7 +218,7 @@ def test_the_gate_opens_before_the_light_and_power_up_colours_are_overwritten(so
         ring = Apa102Ring(chain, guardian, LEASE_S, RecordingPulse())
         calls.clear()
         with ring.on(Illumination("green")):
-            shown = [set(one["lit"]) for one in emulated_buses().messages[calls[0][2] :]]
+            shown = [set(message["lit"]) for message in emulated_buses().messages[calls[0][2] :]]
         ring.close()
     assert calls[0][:2] == ("start", LEASE_S)
     assert shown == [{"0", "9"}, set(), {str(led) for led in (19, 20, 26, 29, 34, 37, 43, 44)}]

@@ -50,7 +50,7 @@ def test_the_ring_shines_at_the_permitted_level_and_half_of_the_time(spec):
         pulse(run, MemoryLedger(SystemClock()), SystemClock(), lambda _: None)
         late_s = LATE_S + sleeper.dark_limit_s(begun_s, time.monotonic()) - DARK_S
     changes = emulated_buses().sinks.messages[before:]
-    lit = [(one["at_s"], after["at_s"], one["lit"]) for one, after in pairwise(changes) if one["lit"]]
+    lit = [(change["at_s"], after["at_s"], change["lit"]) for change, after in pairwise(changes) if change["lit"]]
     assert len(lit) == run.count == 2
     for begin_s, end_s, leds in lit:
         assert end_s - begin_s >= run.on_s - late_s  # the end is the guard's: tests/unit/test_guard.py

@@ -29,7 +29,10 @@ def found() -> dict[str, tuple[bool, str, str]]:
     spec = head_with_real_drivers()
     quick = spec.camera.model_copy(update={"preview_exposure_s": 0.02})
     spec = spec.model_copy(update={"camera": quick})
-    return {one.part: (one.ok, one.reading, one.remedy) for one in probe(spec, SystemClock(), MemoryAllocator())}
+    return {
+        finding.part: (finding.ok, finding.reading, finding.remedy)
+        for finding in probe(spec, SystemClock(), MemoryAllocator())
+    }
 
 
 def test_every_present_part_is_listed(sensor):

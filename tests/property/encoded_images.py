@@ -402,7 +402,7 @@ def random_dng(rng: np.random.Generator) -> Encoded:
 
 def padded(draft: Draft) -> tuple[int, int]:
     """Add noise around the stored image; return the rows above it and the columns left of it."""
-    top, left, below, right = (int(one) for one in draft.rng.integers(0, 9, 4))
+    top, left, below, right = (int(value) for value in draft.rng.integers(0, 9, 4))
     noise = draft.rng.integers(
         0, draft.top + 1, (draft.stored.shape[0] + top + below, draft.stored.shape[1] + left + right, 1)
     )
@@ -428,7 +428,7 @@ def with_margins(draft: Draft) -> None:
 
 def black_of_sites(draft: Draft) -> None:
     """Add a black level to each of 2 x 2 sites, from the corner of the active area."""
-    top, left = (int(one) for one in draft.tags.get(50829, ("I", (0, 0)))[1][:2])
+    top, left = (int(value) for value in draft.tags.get(50829, ("I", (0, 0)))[1][:2])
     levels = draft.rng.integers(16, 80, (2, 2)) * 16
     rows, cols = (np.arange(size)[:, None] for size in draft.stored.shape[:2])
     excess = (levels - levels.min())[(rows - top) % 2, (cols.T - left) % 2][..., None]
@@ -559,7 +559,7 @@ def refused_png(rng: np.random.Generator) -> Encoded:
     """Return a PNG with one property that is not applied."""
     name = str(rng.choice(list(REFUSED_PNG)))
     word, depth, colour, chunks = REFUSED_PNG[name]
-    rows, cols = (int(one) for one in rng.integers(33, 90, 2))
+    rows, cols = (int(value) for value in rng.integers(33, 90, 2))
     width = -(-cols * depth * {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colour] // 8)
     lines = rng.integers(0, 256, (rows, width)).astype(np.uint8)
     lines[0, :2] = 0x12, 0x34

@@ -330,9 +330,9 @@ class Run:
         )
         journal = CaptureJournal(bench.store)
         resumed = resumed_presses(
-            journal, lambda one: CaptureTarget(one.press.visit, one.press.slot, permit=self._permit_resumed)
+            journal, lambda capture: CaptureTarget(capture.press.visit, capture.press.slot, permit=self._permit_resumed)
         )
-        self.resumed = [one.press.future for one in resumed]
+        self.resumed = [entry.press.future for entry in resumed]
         return ExamParts(
             head,
             bench.store,
@@ -596,14 +596,14 @@ class Sequences:
 def sequences() -> Iterator[Sequences]:
     """Yield a runner of sequences in a temporary folder."""
     with TemporaryDirectory(prefix="exam") as place:
-        one = Sequences(Path(place))
-        with one.undo:
-            yield one
+        runner = Sequences(Path(place))
+        with runner.undo:
+            yield runner
 
 
 def run(count: int) -> Sequences:
     """Run `count` random sequences; raise AssertionError at the first violation, with the smallest sequence found."""
-    with sequences() as one:
+    with sequences() as runner:
 
         @settings(
             max_examples=count,
@@ -615,11 +615,11 @@ def run(count: int) -> Sequences:
         )
         @given(SEQUENCE)
         def play(actions: list[Action]) -> None:
-            violations = one.play(actions)
+            violations = runner.play(actions)
             assert not violations, "\n".join(violations)
 
         play()
-    return one
+    return runner
 
 
 def main() -> int:
@@ -627,11 +627,11 @@ def main() -> int:
     logging.disable(logging.WARNING)  # each injected fault is logged
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
     begin_s = time.monotonic()
-    one = run(count)
+    runner = run(count)
     took_s = time.monotonic() - begin_s
-    sys.stdout.write(f"{one.count} sequences in {took_s:.0f} s, {len(one.violations)} violations\n")
-    sys.stdout.write(", ".join(f"{name} {number}" for name, number in sorted(one.done.items())) + "\n")
-    return int(bool(one.violations))
+    sys.stdout.write(f"{runner.count} sequences in {took_s:.0f} s, {len(runner.violations)} violations\n")
+    sys.stdout.write(", ".join(f"{name} {number}" for name, number in sorted(runner.done.items())) + "\n")
+    return int(bool(runner.violations))
 
 
 if __name__ == "__main__":

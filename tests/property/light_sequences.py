@@ -365,7 +365,7 @@ class Eyes(RuleBasedStateMachine):
                     head, (eye,), self.times, in_visit=in_visit, count=count, colours=colours, split=split
                 )
                 assert not self.disk.full, "light without a record"
-                assert sum(one.exposure_s for one in made.lit) <= count * exposure_s * (1 + 1e-9)
+                assert sum(frame.exposure_s for frame in made.lit) <= count * exposure_s * (1 + 1e-9)
                 self.tally["split press"] += parts > 1
                 self.tally[f"press of {len(made.lit)} frames and {len(made.colours)} colours"] += 1
         except Killed:

@@ -120,9 +120,9 @@ def stored_reports(draw: st.DrawFn) -> dict[str, Any]:
     return draw(unknown) | report
 
 
-def same(one: object, other: object) -> bool:
+def same(left: object, right: object) -> bool:
     """Return whether two values are the same JSON; 1, 1.0 and true differ."""
-    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+    return json.dumps(left, sort_keys=True) == json.dumps(right, sort_keys=True)
 
 
 @given(stored_reports())

@@ -9,11 +9,11 @@ COUNT = 200
 
 
 def test_random_sequences_keep_every_rule() -> None:
-    one = exam_sequences.run(COUNT)
-    assert one.violations == []
-    assert one.count >= COUNT
-    assert one.done["stored"] > COUNT // 4, "the sequences must make captures"
-    assert set(exam_sequences.ACTIONS) <= set(one.done)
+    runner = exam_sequences.run(COUNT)
+    assert runner.violations == []
+    assert runner.count >= COUNT
+    assert runner.done["stored"] > COUNT // 4, "the sequences must make captures"
+    assert set(exam_sequences.ACTIONS) <= set(runner.done)
 
 
 def test_a_failure_of_the_lamps_last_off_during_a_suspended_refinement_loses_no_second_capture() -> None:
@@ -29,6 +29,6 @@ def test_a_failure_of_the_lamps_last_off_during_a_suspended_refinement_loses_no_
         act("verdict", "fault", choice=lamp),
         act("failed", "repair"),
     ]
-    with exam_sequences.sequences() as one:
-        assert one.play(script) == []
-    assert (one.done["accepted"], one.done["stored"]) == (2, 1)
+    with exam_sequences.sequences() as runner:
+        assert runner.play(script) == []
+    assert (runner.done["accepted"], runner.done["stored"]) == (2, 1)

@@ -247,7 +247,7 @@ def test_pictures_of_an_archive(inputs: Path, simulated: bool) -> None:
     (calibration,), (capture,) = plan.calibrations, plan.captures
     files = CalibrationFiles(inputs / "calibrations")
     named = zip(local_names(calibration), calibration.files, strict=True)
-    files.add(calibration.digest, {name: Path(one.path).read_bytes() for (_, name), one in named})
+    files.add(calibration.digest, {name: Path(file.path).read_bytes() for (_, name), file in named})
     done = Solvers(files).solve(Task(capture, calibration, plan.settings, plan.software), results, "worker")
     assert done.failure is None, done.failure
     check(results.place(capture.result) / "picture.tiff", simulated)
@@ -327,7 +327,7 @@ def taken(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     (folder / "head.toml").write_text(small_head_toml("Small simulated head"))
     build = rig_builder(coarsened(load_head(folder / "head.toml")), tmp_path_factory.mktemp("plans"))
     with ExitStack() as undo:
-        rig = build(folder, undo, camera=(lambda one: one) if simulated else UnmarkedCamera)
+        rig = build(folder, undo, camera=(lambda camera: camera) if simulated else UnmarkedCamera)
         visit = visit_with_consent(rig)
         press = {"key": token_hex(8), "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
         answer = rig.request("POST", "/api/captures", json=press)
@@ -421,7 +421,7 @@ def test_picture_of_another_method(head: Path, tmp_path: Path, simulated: bool) 
     explorer = AccuracyExplorer(
         tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, lambda kind, **_: None, measure_scene
     )
-    raw, dark = (raw_tiff(one, RawMetadata()) for one in (scene.counts, np.full_like(scene.counts, 64)))
+    raw, dark = (raw_tiff(counts, RawMetadata()) for counts in (scene.counts, np.full_like(scene.counts, 64)))
     again = explorer.reconstruct(StoredCapture(raw, dark, scene.calibration, simulated), Recipe("tikhonov", 1))
     check_pixels("again.png", again, simulated)
 
@@ -628,8 +628,8 @@ def test_every_command_and_every_endpoint_is_listed() -> None:
     found = {
         path
         for path, methods in paths.items()
-        for one in methods.values()
-        for answer in one.get("responses", {}).values()
+        for operation in methods.values()
+        for answer in operation.get("responses", {}).values()
         if any(kind.startswith(kinds) for kind in answer.get("content", {}))
     }
     assert found == ENDPOINTS

@@ -58,8 +58,8 @@ def test_two_swapped_neighbours_are_detected(counter: int, place: int) -> None:
 
 
 @given(counters, counters)
-def test_different_counters_give_different_numbers(one: int, other: int) -> None:
-    assert (automatic_number("A", one) == automatic_number("A", other)) == (one == other)
+def test_different_counters_give_different_numbers(left: int, right: int) -> None:
+    assert (automatic_number("A", left) == automatic_number("A", right)) == (left == right)
 
 
 @given(st.text(max_size=30))
@@ -82,7 +82,7 @@ taken = st.builds(
     st.from_regex("[a-z]{8}", fullmatch=True),
     st.sampled_from(["good", "again", None]),
 )
-slot_states = st.lists(taken, max_size=4, unique_by=lambda one: one.capture).flatmap(
+slot_states = st.lists(taken, max_size=4, unique_by=lambda shot: shot.capture).flatmap(
     lambda shots: st.builds(
         SlotState,
         st.just(tuple(shots)),
@@ -90,7 +90,7 @@ slot_states = st.lists(taken, max_size=4, unique_by=lambda one: one.capture).fla
             st.none(),
             st.just(SlotDecision()),
             st.just(SlotDecision(reason="pupil")),
-            *(st.just(SlotDecision(one.capture)) for one in shots),
+            *(st.just(SlotDecision(shot.capture)) for shot in shots),
         ),
     )
 )
@@ -136,12 +136,12 @@ def test_the_chosen_picture_of_a_slot_is_one_of_its_own(slot: SlotState) -> None
     assert (slot.state == "taken") == (chosen is not None)
     if slot.decision is None and slot.captures:
         assert chosen is not None
-        assert chosen.is_good == any(one.is_good for one in slot.captures)  # a good one, if there is any
+        assert chosen.is_good == any(shot.is_good for shot in slot.captures)  # a good one, if there is any
 
 
 @given(slot_states, taken)
 def test_another_picture_never_makes_a_slot_worse(slot: SlotState, new: SlotCapture) -> None:
-    assume(new.capture not in {one.capture for one in slot.captures})
+    assume(new.capture not in {shot.capture for shot in slot.captures})
     after = SlotState((*slot.captures, new), decision_after(slot, new))
     assert after.state == "taken"
     assert after.chosen is not None

@@ -41,7 +41,7 @@ def blanked_after(machine: Machine, end_s: float, why: str, patience_s: float = 
     """Return the first run of the blanker after `end_s` for reason `why`; print the delay."""
 
     def answers() -> list[Blanked]:
-        return [one for one in machine.blanked() if one.at_s > end_s and one.why == why]
+        return [blanking for blanking in machine.blanked() if blanking.at_s > end_s and blanking.why == why]
 
     machine.until(lambda: bool(answers()), patience_s)
     first = answers()[0]
@@ -161,11 +161,11 @@ def test_instrument_stays_down_and_is_blanked_after_five_failures(machine: Machi
         if machine.main_pid():
             machine.signal(SIGKILL)
         time.sleep(0.1)
-    ends = [one for one in machine.blanked() if one.at_s > begin_s and one.why == "signal"]
+    ends = [blanking for blanking in machine.blanked() if blanking.at_s > begin_s and blanking.why == "signal"]
     assert len(ends) == 5
     machine.until(lambda: machine.show("diffuscope-dark.service", "ExecMainExitTimestampMonotonic") != ["0"])
     assert machine.show("diffuscope-dark.service", "Result") == ["success"]  # also without SPI
-    given_up = [one for one in machine.blanked() if one.at_s > ends[-1].at_s and one.why == "-"]
+    given_up = [blanking for blanking in machine.blanked() if blanking.at_s > ends[-1].at_s and blanking.why == "-"]
     assert given_up
     time.sleep(2)
     assert machine.show(UNIT, "ActiveState", "MainPID") == ["failed", "0"]

@@ -130,16 +130,16 @@ export function standing(state, actions) {
 }
 
 /** Bar of one alert with its text, countdown and buttons. */
-export function alertBar(one, actions) {
-  const left = timeLeft(one.until);
-  const text = one.assertive ? html`<p role="alert">${alertText(one)}</p>` : html`<p>${alertText(one)}</p>`;
+export function alertBar(alert, actions) {
+  const left = timeLeft(alert.until);
+  const text = alert.assertive ? html`<p role="alert">${alertText(alert)}</p>` : html`<p>${alertText(alert)}</p>`;
   const open = get().route.slot && !get().visit?.finished_at;
-  const shownButtons = one.buttons.filter((name) => open || !EXAM_BUTTONS.has(name));
-  const buttons = one.from === "press" ? [...shownButtons, "ok"] : shownButtons;
+  const shownButtons = alert.buttons.filter((name) => open || !EXAM_BUTTONS.has(name));
+  const buttons = alert.from === "press" ? [...shownButtons, "ok"] : shownButtons;
   return html`
-    <div class="state-bar" data-code=${one.code}>
-      ${icon(one.code === "link.lost" ? "nolink" : "warn")} ${text} ${left ? html`<b class="clock">${left}</b>` : nothing}
-      ${buttons.length ? html`<span class="does">${buttons.map((name) => alertButton(one, name, actions))}</span>` : nothing}
+    <div class="state-bar" data-code=${alert.code}>
+      ${icon(alert.code === "link.lost" ? "nolink" : "warn")} ${text} ${left ? html`<b class="clock">${left}</b>` : nothing}
+      ${buttons.length ? html`<span class="does">${buttons.map((name) => alertButton(alert, name, actions))}</span>` : nothing}
     </div>
   `;
 }
@@ -157,9 +157,9 @@ export function chips(state, actions) {
   return html`
     <ul class="notices" aria-label=${t("part.notices")}>
       ${shown.map(
-        (one) => html`<li class=${one.level} data-code=${one.code}>
-          <p role=${one.assertive ? "alert" : nothing}>${alertText(one)}</p>
-          ${one.until ? html`<b class="clock">${timeLeft(one.until)}</b>` : nothing} ${one.buttons.map((name) => alertButton(one, name, actions))}
+        (alert) => html`<li class=${alert.level} data-code=${alert.code}>
+          <p role=${alert.assertive ? "alert" : nothing}>${alertText(alert)}</p>
+          ${alert.until ? html`<b class="clock">${timeLeft(alert.until)}</b>` : nothing} ${alert.buttons.map((name) => alertButton(alert, name, actions))}
         </li>`,
       )}
     </ul>
@@ -178,25 +178,25 @@ function isSaidElsewhere(state, code) {
 
 const ALERT_LINKS = { technician: "/technician", pin: "/technician", setClock: "/technician" };
 
-export const alertButton = (one, name, actions) =>
+export const alertButton = (alert, name, actions) =>
   ALERT_LINKS[name]
     ? html`<a class="button" href=${ALERT_LINKS[name]}>${t(`do.${name}`)}</a>`
-    : html`<button type="button" data-do=${name} @click=${() => actions.runAlertButton(name, one)}>${t(`do.${name}`)}</button>`;
+    : html`<button type="button" data-do=${name} @click=${() => actions.runAlertButton(name, alert)}>${t(`do.${name}`)}</button>`;
 
 /**
  * Group of toggle buttons: one choice, or several with `many`.
- * @param {{label: string, field?: string, value: any, options: any[][], choose: (one: any) => void, many?: boolean}} group
+ * @param {{label: string, field?: string, value: any, options: any[][], choose: (option: any) => void, many?: boolean}} group
  */
 export function choice({ label, field, value, options, choose, many = false }) {
-  const on = (one) => (many ? (value ?? []).includes(one) : value === one);
+  const on = (option) => (many ? (value ?? []).includes(option) : value === option);
   return html`
     <div class="choice" role="group" aria-label=${label} data-field=${field}>
       ${options.map(
-        ([one, word]) => html`<button
+        ([option, word]) => html`<button
           type="button"
-          data-value=${String(one)}
-          aria-pressed=${on(one)}
-          @click=${() => choose(one)}
+          data-value=${String(option)}
+          aria-pressed=${on(option)}
+          @click=${() => choose(option)}
         >
           ${icon("check")}<span>${word}</span>
         </button>`,

@@ -33,7 +33,7 @@ function psfText({ gain_db: gain = null }) {
 export function detailsDialog({ grey, visit }, actions, { record: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
   const totalS = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
-  const used = frames.filter((one) => one.used).length;
+  const used = frames.filter((frame) => frame.used).length;
   const channels = report.channels ?? [];
   const rows = [
     ["method", report.method],
@@ -41,7 +41,7 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
     ["stopped", report.stopped],
     ...(frames.length ? [["frames", t("detail.frames.value", { used, all: frames.length })]] : []),
     ...(channels.length ? [["channels", channels.map(channelText).join(", ")]] : []),
-    ...(links.colour ? [["hue", t(channels.some((one) => one.white_ratio != null) ? "detail.hue.card" : "detail.hue.neutral")]] : []),
+    ...(links.colour ? [["hue", t(channels.some((channel) => channel.white_ratio != null) ? "detail.hue.card" : "detail.hue.neutral")]] : []),
     ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
     ...(report.psf_cylinder ? [["psf", psfText(report.psf_cylinder)]] : []),
     ["seconds", t("detail.seconds.value", { s: number(totalS, 2) })],
@@ -54,7 +54,7 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
   };
   return html`<dialog id="details" aria-labelledby="details-title">
     <h2 id="details-title">${t("result.details")}</h2>
-    ${(report.warnings ?? []).map((one) => html`<p class="warning">${icon("warn")} ${one}</p>`)}
+    ${(report.warnings ?? []).map((warning) => html`<p class="warning">${icon("warn")} ${warning}</p>`)}
     ${whyGreen(visit) ? html`<p class="muted">${whyGreen(visit)}</p>` : grey && !links.colour ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
     <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
     <p class="links">
@@ -64,7 +64,7 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
             ${t("result.othereye", { other: t(`eye.${eye === "OD" ? "OS" : "OD"}.word`) })}
           </button>`}
       ${["colour", "picture", "raw", "report"].filter((key) => links[key]).map((key) => html`<a class="button" href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
-      ${versions.map((one) => html`<a class="button" href=${one.colour ?? one.picture} download>${versionName(one)} (PNG)</a>`)}
+      ${versions.map((version) => html`<a class="button" href=${version.colour ?? version.picture} download>${versionName(version)} (PNG)</a>`)}
     </p>
     <button class="primary" type="button" @click=${close}>${t("menu.close")}</button>
   </dialog>`;

@@ -64,7 +64,7 @@ const languages = ({ tag }) => html`
       label: t("voice.language"),
       field: "voice",
       value: tag,
-      options: Object.entries(LANGUAGES).map(([one, { name }]) => [one, name]),
+      options: Object.entries(LANGUAGES).map(([language, { name }]) => [language, name]),
       choose: chooseVoice,
     })}
     ${LANGUAGES[tag].draft ? html`<p class="muted">${t("voice.draft")}</p>` : nothing}

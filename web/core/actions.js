@@ -104,7 +104,7 @@ const examActions = {
   openPicture: (slot, capture) => navigate({ screen: "picture", visit: currentRoute().visit, slot, capture }),
   pick(id) {
     const { picked } = get();
-    set({ picked: picked.includes(id) ? picked.filter((one) => one !== id) : [...picked, id].slice(-2) });
+    set({ picked: picked.includes(id) ? picked.filter((pickedId) => pickedId !== id) : [...picked, id].slice(-2) });
   },
   compare: () => navigate({ screen: "compare", visit: currentRoute().visit, capture: get().picked[0], other: get().picked[1] }),
   setBlink: (blink) => set({ blink, front: 0 }),

@@ -114,7 +114,7 @@ export function syncNotices(all) {
   const codes = new Set(all.map(({ code }) => code));
   for (const code of dismissed) if (!codes.has(code)) dismissed.delete(code);
   lowerAlerts(({ from, level, code }) => from === "notice" && level !== "ask" && !codes.has(code));
-  for (const one of all) raiseAlert({ ...one, from: "notice" });
+  for (const notice of all) raiseAlert({ ...notice, from: "notice" });
 }
 
 /** End an alert of the server; it is shown if it begins again. */
@@ -159,7 +159,7 @@ export function lowerAlerts(isOver) {
   if (left.length !== get().alerts.length) set({ alerts: Object.freeze(left) });
 }
 
-const worstFirst = (one, other) => one.rank - other.rank;
+const worstFirst = (left, right) => left.rank - right.rank;
 
 /** Return the blocking alert of a visit without consent. */
 function consentAlerts({ route, visit }) {

@@ -65,14 +65,14 @@ async function submitCapture(visit, slot) {
 // A failed capture that the server had begun is reported, because a good verdict may have been shown.
 function failCapture(key, problem) {
   const { code, message, remedy } = problem;
-  const capture = get().captures.find((one) => one.key === key);
+  const capture = get().captures.find((candidate) => candidate.key === key);
   if (!capture || capture.over) return;
   const here = currentCapture(get())?.key === key;
   if (capture.id && code === "link.cut") {
     updateCapture(key, { answerLost: true }); // perhaps the server kept it; queried when the connection is back
   } else {
     if (capture.id) updateCapture(key, { over: true, failed: { code, message, remedy } });
-    else setCaptures(get().captures.filter((one) => one.key !== key));
+    else setCaptures(get().captures.filter((other) => other.key !== key));
     if (here) navigate({ screen: "aim", visit: capture.visit, slot: capture.slot }, { replace: true });
   }
   if (here || !capture.id) raiseRefusal(problem); // on other screens the chip of the lost picture is shown
@@ -95,7 +95,7 @@ export async function resolveCutCaptures() {
 
 function completeCapture(record, key = captureById(record.id)?.key) {
   finishedIds.add(record.id);
-  const capture = get().captures.find((one) => one.key === key);
+  const capture = get().captures.find((candidate) => candidate.key === key);
   if (!capture || capture.record) return;
   const verdict = record.verdict ?? capture.verdict;
   if (verdict?.word !== "good" || capture.verdict?.word !== "good") buttonsChanged();
@@ -119,8 +119,8 @@ export const captureEventHandlers = {
   stage({ id, key, visit, slot, stage: name, url, fraction, left_s: left }) {
     if (finishedIds.has(id)) return;
     // Match by key, or by visit and slot after a reload, so that another screen's capture is not matched.
-    const matches = (one) => one.key === key || (one.reloaded && one.visit === visit && one.slot === slot);
-    const capture = captureById(id) ?? get().captures.find((one) => !one.id && !one.over && matches(one));
+    const matches = (candidate) => candidate.key === key || (candidate.reloaded && candidate.visit === visit && candidate.slot === slot);
+    const capture = captureById(id) ?? get().captures.find((candidate) => !candidate.id && !candidate.over && matches(candidate));
     if (!capture || capture.over) return;
     // The progress bar never moves backwards.
     const stage = { name, fraction: Math.max(capture.stage.fraction, fraction ?? 0), left: left ?? 0 };

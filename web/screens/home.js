@@ -63,16 +63,16 @@ function languages({ language }, actions) {
 /** @param {State} state */
 export function find({ typed, visits }, actions) {
   const found = (visits ?? []).filter(({ number }) => number.includes(typed) || displayNumber(number).includes(typed)).slice(0, 20);
-  const one = visits && typed ? found.find((visit) => isNumber(visit, typed)) : undefined;
+  const match = visits && typed ? found.find((visit) => isNumber(visit, typed)) : undefined;
   return html`
     <section class="find">
       <div>
         <h2>${t("find.title")}</h2>
         <p class="typed" aria-live="polite">${typed || "\u00a0"}</p>
         ${numberPad(actions.typeNumber)}
-        ${one
-          ? html`<button class="primary" type="button" id="open-found" @click=${() => actions.resume(one)}>
-              ${t("find.open.one", { number: displayNumber(one.number) })}
+        ${match
+          ? html`<button class="primary" type="button" id="open-found" @click=${() => actions.resume(match)}>
+              ${t("find.open.one", { number: displayNumber(match.number) })}
             </button>`
           : html`<p class="no-match" aria-live="polite">
               ${typed && visits ? t(found.length ? "find.choose" : "find.nomatch", { number: typed }) : "\u00a0"}

@@ -114,8 +114,8 @@ function menu({ theme, letters, auto, sound, status }, actions) {
       <h3 id="menu-theme">${t("menu.theme")}</h3>
       <div class="pair" role="group" aria-labelledby="menu-theme">
         ${["dim", "daylight"].map(
-          (one) => html`<button type="button" aria-pressed=${one === theme} @click=${() => actions.setTheme(one)}>
-            ${t(`theme.${one}`)}
+          (option) => html`<button type="button" aria-pressed=${option === theme} @click=${() => actions.setTheme(option)}>
+            ${t(`theme.${option}`)}
           </button>`,
         )}
       </div>

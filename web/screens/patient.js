@@ -29,7 +29,7 @@ const QUESTIONS = [
 
 // Eye drops are stored as the time when they were given, because the effect on the pupil changes.
 const isDrops = (name) => name.startsWith("drops_");
-const fieldValue = (name, one) => (isDrops(name) ? (one ? new Date().toISOString() : null) : one);
+const fieldValue = (name, answer) => (isDrops(name) ? (answer ? new Date().toISOString() : null) : answer);
 
 /** @param {State} state */
 export function patient(state, actions) {
@@ -90,9 +90,9 @@ function question(visit, actions, name, answers) {
   const value = visit.fields[name];
   if (name === "age") return age(value, actions);
   const many = name === "complaints";
-  const choose = (one) => actions.setField(name, many ? toggled(value ?? [], one) : fieldValue(name, one));
+  const choose = (answer) => actions.setField(name, many ? toggled(value ?? [], answer) : fieldValue(name, answer));
   const chosen = isDrops(name) && value !== undefined ? value !== null : value;
-  const urgent = many && (value ?? []).some((one) => URGENT.includes(one));
+  const urgent = many && (value ?? []).some((complaint) => URGENT.includes(complaint));
   return html`
     <div class="question">
       <h3>${label}</h3>
@@ -103,9 +103,9 @@ function question(visit, actions, name, answers) {
 }
 
 /** "None" excludes the other complaints; an empty list is no answer. */
-function toggled(before, one) {
-  if (before.includes(one)) return orNull(before.filter((other) => other !== one));
-  return one === "none" ? ["none"] : [...before.filter((other) => other !== "none"), one];
+function toggled(before, complaint) {
+  if (before.includes(complaint)) return orNull(before.filter((other) => other !== complaint));
+  return complaint === "none" ? ["none"] : [...before.filter((other) => other !== "none"), complaint];
 }
 
 const orNull = (list) => (list.length ? list : null);

@@ -143,7 +143,7 @@ function tools({ redfree, version, visit, brightness, contrast, loupe, zoom }, a
 // The picture as taken and its later versions; nothing for a capture without versions.
 function versions(value, actions, capture) {
   if (!capture?.versions) return nothing;
-  const options = [[0, t("version.taken")], ...capture.versions.map((one) => [one.number, versionName(one)])];
+  const options = [[0, t("version.taken")], ...capture.versions.map((version) => [version.number, versionName(version)])];
   return choice({ label: t("version.label"), field: "version", value, options, choose: actions.setVersion });
 }
 

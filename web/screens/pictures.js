@@ -20,7 +20,7 @@ export function pictures(state, actions) {
       <h2>${t("pictures.title", { number: displayNumber(visit.number) })}</h2>
       ${visit.outcome ? html`<p>${outcomeTexts(visit.outcome, state.language).filter(Boolean).join(" · ")}</p>` : nothing}
       ${whyGreen(visit) ? html`<p class="muted" id="green">${whyGreen(visit)}</p>` : nothing}
-      ${taken.length ? html`<ul>${taken.map((one) => captureItem(state, actions, one))}</ul>` : html`<p>${t("pictures.none")}</p>`}
+      ${taken.length ? html`<ul>${taken.map((capture) => captureItem(state, actions, capture))}</ul>` : html`<p>${t("pictures.none")}</p>`}
       ${Object.entries(state.montages).map(([eye, made]) => montage(visit, actions, eye, made))}
       <div class="ends">
         ${picked.length === 2
@@ -44,7 +44,7 @@ export function pictures(state, actions) {
  * @param {State} state
  */
 function captureLabel(state, id) {
-  const found = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id));
+  const found = Object.entries(state.visit?.slots ?? {}).find(([, slotState]) => slotState.captures.includes(id));
   if (!found) return "";
   const [slot, { captures }] = found;
   return t(captures.length > 1 ? "pictures.name.n" : "pictures.name", { ...slotLabel(state, slot), count: captures.indexOf(id) + 1 });
@@ -77,7 +77,7 @@ function captureItem(state, actions, { slot, id }) {
  */
 function montage(visit, actions, eye, { state, digest, pictures, placed }) {
   if (!pictures) return nothing;
-  const used = placed.filter((one) => one.used).length;
+  const used = placed.filter((picture) => picture.used).length;
   const text = t(`montage.${state}`, { count: used });
   const leftOut = state === "joined" && used < pictures ? t("montage.leftout") : "";
   return html`<figure class="montage" data-eye=${eye} data-state=${state}>
@@ -152,7 +152,7 @@ export function compare(state, actions) {
 function comparedPicture(state, actions, i) {
   const { route, status, blink, front = 0, redfree, loupe } = state;
   const id = [route.capture, route.other][i];
-  const taken = state.compared.find((one) => one.id === id);
+  const taken = state.compared.find((capture) => capture.id === id);
   return html`<figure class=${blink && i !== front ? "behind" : ""}>
     <figcaption><b>${captureLabel(state, id)}</b> ${taken ? clockTime(taken.taken_at) : nothing} ${usedMark(state, id)}</figcaption>
     <eye-pic

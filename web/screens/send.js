@@ -20,7 +20,7 @@ export function send({ uploadQueue }, actions) {
             ${icon("again")} ${t("do.tryNow")}
           </button>`
         : nothing}
-      <ul class="people">${visits.map((one) => queuedVisit(one, actions))}</ul>
+      <ul class="people">${visits.map((visit) => queuedVisit(visit, actions))}</ul>
     </section>
   `;
 }

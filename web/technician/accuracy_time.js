@@ -73,7 +73,7 @@ class AccuracyTime extends HTMLElement {
     }),
 
     pick: ({ target }) => {
-      const capture = this.#state.captures.find((one) => one.id === target.value);
+      const capture = this.#state.captures.find((candidate) => candidate.id === target.value);
       this.#set({ capture, point: null, recomputed: null, viewport: ALL });
     },
 
@@ -154,17 +154,17 @@ function measuring({ busy, progress, problem, measured }, actions) {
 function points({ accuracy, all, capture, captures }, actions) {
   const { budget_s: budget, region } = accuracy.measured;
   // The method for an unknown field is left out where the field is known: a capture never uses it there.
-  const points = accuracy.measured.points.filter((one) => one.method !== "open" || !region?.field_known);
-  const rows = points.filter((one) => all || one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
+  const points = accuracy.measured.points.filter((point) => point.method !== "open" || !region?.field_known);
+  const rows = points.filter((point) => all || point.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   return html`
     ${plot(points, budget, actions, capture !== null)}
     <div class="row">
       <label><input type="checkbox" .checked=${all} @change=${actions.showAll} /> ${t("explore.all")}</label>
     </div>
     ${capture ? html`<label>${t("explore.capture")}
-      <select @change=${actions.pick}>${captures.map((one) => html`
-        <option value=${one.id} ?selected=${one === capture}>
-          ${t(`eye.${one.eye}`)} ${clockTime(one.taken_at)}${one.test ? ` · ${t("explore.test")}` : ""}
+      <select @change=${actions.pick}>${captures.map((option) => html`
+        <option value=${option.id} ?selected=${option === capture}>
+          ${t(`eye.${option.eye}`)} ${clockTime(option.taken_at)}${option.test ? ` · ${t("explore.test")}` : ""}
         </option>`)}
       </select></label>` : html`<p class="muted">${t("explore.nothing")}</p>`}
     <table>
@@ -172,26 +172,26 @@ function points({ accuracy, all, capture, captures }, actions) {
       <thead><tr>
         ${["method", "seconds", "psnr", "see"].map((name) => html`<th scope="col">${t(`explore.${name}`)}</th>`)}
       </tr></thead>
-      <tbody>${rows.map((one) => html`<tr>
-        <th scope="row">${t("explore.again", one)}${one.pareto ? " ★" : ""}</th>
-        <td>${number(one.seconds_median, 3)}</td><td>${number(one.psnr_db, 1)}</td>
-        <td><button type="button" aria-disabled=${!capture} @click=${() => capture && actions.recompute(one)}
-          aria-label=${t("explore.see.one", one)}>${t("explore.see")}</button></td>
+      <tbody>${rows.map((point) => html`<tr>
+        <th scope="row">${t("explore.again", point)}${point.pareto ? " ★" : ""}</th>
+        <td>${number(point.seconds_median, 3)}</td><td>${number(point.psnr_db, 1)}</td>
+        <td><button type="button" aria-disabled=${!capture} @click=${() => capture && actions.recompute(point)}
+          aria-label=${t("explore.see.one", point)}>${t("explore.see")}</button></td>
       </tr>`)}</tbody>
     </table>
   `;
 }
 
 function plot(points, budget, actions, live) {
-  const times = points.map((one) => one.seconds_median).concat(budget);
-  const psnrs_db = points.map((one) => one.psnr_db);
+  const times = points.map((point) => point.seconds_median).concat(budget);
+  const psnrs_db = points.map((point) => point.psnr_db);
   const [first, last] = [Math.log10(Math.min(...times)) - 0.1, Math.log10(Math.max(...times)) + 0.1];
   const [low, high] = [Math.floor(Math.min(...psnrs_db) - 0.5), Math.ceil(Math.max(...psnrs_db) + 0.5)];
   const x = (seconds) => LEFT + ((Math.log10(seconds) - first) / (last - first)) * (WIDTH - LEFT - RIGHT);
   const y = (db) => HEIGHT - BELOW - ((db - low) / (high - low)) * (HEIGHT - TOP - BELOW);
   const step = Math.max(1, Math.ceil((high - low) / 6));
   const psnrTicks_db = Array.from({ length: Math.floor((high - low) / step) + 1 }, (_, k) => low + k * step);
-  const paretoFront = points.filter((one) => one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
+  const paretoFront = points.filter((point) => point.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   // Hidden from screen readers; the table holds the same values.
   return html`<svg class="plot" viewBox="0 0 ${WIDTH} ${HEIGHT}" aria-hidden="true" focusable="false">
     ${psnrTicks_db.map((db) => svg`<line class="grid" x1=${LEFT} x2=${WIDTH - RIGHT} y1=${y(db)} y2=${y(db)} />
@@ -201,10 +201,10 @@ function plot(points, budget, actions, live) {
     <text x=${(LEFT + WIDTH) / 2} y=${HEIGHT - 8} text-anchor="middle">${t("explore.x")}</text>
     <text x="4" y=${TOP - 2}>${t("explore.y")}</text>
     <line class="limit" x1=${x(budget)} x2=${x(budget)} y1=${TOP} y2=${HEIGHT - BELOW} />
-    <polyline class="edge" points=${paretoFront.map((one) => `${x(one.seconds_median)},${y(one.psnr_db)}`).join(" ")} />
-    ${points.map((one) => svg`<circle class=${one.pareto ? "best" : "other"} r=${one.pareto ? 8 : 4}
-      cx=${x(one.seconds_median)} cy=${y(one.psnr_db)} @click=${() => live && actions.recompute(one)}>
-      <title>${t("explore.see.one", one)}</title></circle>`)}
+    <polyline class="edge" points=${paretoFront.map((point) => `${x(point.seconds_median)},${y(point.psnr_db)}`).join(" ")} />
+    ${points.map((point) => svg`<circle class=${point.pareto ? "best" : "other"} r=${point.pareto ? 8 : 4}
+      cx=${x(point.seconds_median)} cy=${y(point.psnr_db)} @click=${() => live && actions.recompute(point)}>
+      <title>${t("explore.see.one", point)}</title></circle>`)}
   </svg>`;
 }
 
@@ -214,7 +214,7 @@ function comparison({ capture, head, point, recomputed, viewport }, actions) {
   return html`
     <h3>${t("explore.beside", point)}</h3>
     <div class="row" role="group" aria-label=${t("explore.zoom")}>
-      ${ZOOMS.map((one) => html`<button type="button" aria-pressed=${one === viewport.zoom} @click=${() => actions.zoom(one)}>${one}×</button>`)}
+      ${ZOOMS.map((zoom) => html`<button type="button" aria-pressed=${zoom === viewport.zoom} @click=${() => actions.zoom(zoom)}>${zoom}×</button>`)}
     </div>
     <div class="pair">
       <figure>

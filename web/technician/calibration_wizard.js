@@ -132,26 +132,26 @@ function startWord(cal, by, busy) {
 }
 
 function activeCalibration(cal) {
-  const one = cal.in_force;
-  if (!one) return html`<p class="card">${t(cal.kind === "simulated" ? "cal.none.simulated" : "cal.none")}</p>`;
-  if (one.damaged) return nothing; // the error above shows it
-  return html`<div class="card"><h3>${t("cal.inforce")}</h3>${provenance(one)}</div>`;
+  const calibration = cal.in_force;
+  if (!calibration) return html`<p class="card">${t(cal.kind === "simulated" ? "cal.none.simulated" : "cal.none")}</p>`;
+  if (calibration.damaged) return nothing; // the error above shows it
+  return html`<div class="card"><h3>${t("cal.inforce")}</h3>${provenance(calibration)}</div>`;
 }
 
 function earlierCalibrations({ kept }, actions) {
-  const others = kept.filter((one) => !one.in_force);
+  const others = kept.filter((calibration) => !calibration.in_force);
   if (!others.length) return nothing;
   return html`
     <section class="card" aria-labelledby="earlier">
       <h3 id="earlier">${t("cal.earlier")}</h3>
       <ul class="earlier">
-        ${others.map((one) =>
-          one.damaged
-            ? html`<li class="warning">${icon("warn")} ${t("cal.damaged", { id: one.id })}</li>`
+        ${others.map((calibration) =>
+          calibration.damaged
+            ? html`<li class="warning">${icon("warn")} ${t("cal.damaged", { id: calibration.id })}</li>`
             : html`<li>
-                <span>${one.serial} · ${one.made_by}</span>
-                <button type="button" data-id=${one.id} @click=${() => actions.use(one.id)}>
-                  ${t("cal.back", { when: when(one.made_at) })}
+                <span>${calibration.serial} · ${calibration.made_by}</span>
+                <button type="button" data-id=${calibration.id} @click=${() => actions.use(calibration.id)}>
+                  ${t("cal.back", { when: when(calibration.made_at) })}
                 </button>
               </li>`,
         )}
@@ -228,7 +228,7 @@ function faultSelect({ mishaps }, chosen, actions) {
     <label class="field">${t("mishap.why")}
       <select id="mishap" @change=${actions.choose}>
         <option value="" .selected=${!chosen}>${t("mishap.none")}</option>
-        ${mishaps.map((one) => html`<option value=${one} .selected=${one === chosen}>${one}</option>`)}
+        ${mishaps.map((mishap) => html`<option value=${mishap} .selected=${mishap === chosen}>${mishap}</option>`)}
       </select>
     </label>
   </details>`;
@@ -268,16 +268,16 @@ function done({ cal }, actions) {
   `;
 }
 
-function provenance(one) {
-  const warm = one.temperature_c;
+function provenance(calibration) {
+  const warm = calibration.temperature_c;
   const rows = [
-    ["serial", one.serial],
-    ...(one.simulated ? [["kind", t("made.simulated")]] : []),
-    ["when", when(one.made_at)],
-    ["by", one.made_by],
+    ["serial", calibration.serial],
+    ...(calibration.simulated ? [["kind", t("made.simulated")]] : []),
+    ["when", when(calibration.made_at)],
+    ["by", calibration.made_by],
     ["temperature",
       warm === null ? t("made.temperature.unknown") : t("made.temperature.value", { v: number(warm, 1) })],
-    ["id", one.id],
+    ["id", calibration.id],
   ];
   return html`<dl>${rows.map(([key, value]) => html`<dt>${t(`made.${key}`)}</dt><dd>${value}</dd>`)}</dl>`;
 }

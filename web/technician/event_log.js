@@ -59,7 +59,7 @@ class EventLog extends HTMLElement {
 customElements.define("instrument-event-log", EventLog);
 
 function view({ entries, warningsOnly, about, folders, message, error }, actions) {
-  const shown = (entries ?? []).filter((one) => !warningsOnly || one.level in LEVELS);
+  const shown = (entries ?? []).filter((entry) => !warningsOnly || entry.level in LEVELS);
   return html`
     <h2>${t("event-log.title")}</h2>
     <div class="row">
@@ -76,16 +76,16 @@ function view({ entries, warningsOnly, about, folders, message, error }, actions
     ${about ? html`<div class="row"><b>${t("event-log.about", { about })}</b>
       <button type="button" @click=${() => actions.showOnly(null)}>${t("event-log.all")}</button></div>` : nothing}
     <p role="status">${entries && (shown.length ? t("event-log.count", { count: shown.length }) : t("event-log.empty"))}</p>
-    <ol class="event-log">${shown.map((one) => entryItem(one, actions, about))}</ol>
+    <ol class="event-log">${shown.map((entry) => entryItem(entry, actions, about))}</ol>
   `;
 }
 
-const entryItem = (one, actions, about) => html`<li class=${one.level}>
-  <p><time datetime=${one.at}>${calendarDay(one.at)}, ${clockTime(one.at)}</time>
-    ${one.level in LEVELS ? html`<b>${LEVELS[one.level]} ${t(`event-log.${one.level}`)}</b>` : nothing} ${one.text}</p>
-  ${one.code || one.about || one.detail ? html`<details><summary>${t("event-log.more")}</summary>
-    <p>${[one.code, one.about].filter(Boolean).join(" · ")}</p>
-    ${one.detail ? html`<pre>${one.detail}</pre>` : nothing}
-    ${one.about && !about ? html`<button type="button" @click=${() => actions.showOnly(one.about)}>${t("event-log.only")}</button>` : nothing}
+const entryItem = (entry, actions, about) => html`<li class=${entry.level}>
+  <p><time datetime=${entry.at}>${calendarDay(entry.at)}, ${clockTime(entry.at)}</time>
+    ${entry.level in LEVELS ? html`<b>${LEVELS[entry.level]} ${t(`event-log.${entry.level}`)}</b>` : nothing} ${entry.text}</p>
+  ${entry.code || entry.about || entry.detail ? html`<details><summary>${t("event-log.more")}</summary>
+    <p>${[entry.code, entry.about].filter(Boolean).join(" · ")}</p>
+    ${entry.detail ? html`<pre>${entry.detail}</pre>` : nothing}
+    ${entry.about && !about ? html`<button type="button" @click=${() => actions.showOnly(entry.about)}>${t("event-log.only")}</button>` : nothing}
   </details>` : nothing}
 </li>`;

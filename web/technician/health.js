@@ -86,8 +86,8 @@ customElements.define("instrument-health", InstrumentHealth);
 const failed = () => html`<p class="bad" role="alert">${t("health.failed")}</p>`;
 
 function view({ ok, checks }, large, speakRemedy) {
-  const unknown = checks.filter((one) => one.ok && !one.known).length;
-  const lines = (which) => checks.filter((one) => one.ok === which).map((one) => checkItem(one, large === one.name, speakRemedy));
+  const unknown = checks.filter((check) => check.ok && !check.known).length;
+  const lines = (which) => checks.filter((check) => check.ok === which).map((check) => checkItem(check, large === check.name, speakRemedy));
   return html`
     <h2>${t("health.title")}</h2>
     <div role="status" aria-atomic="false">
@@ -104,14 +104,14 @@ function view({ ok, checks }, large, speakRemedy) {
 // Name of the active renderer; after a failed self-test it is the 2-D canvas.
 const rendererName = () => t(pictureRenderer().renderer.name === "2d" ? "health.painter.2d" : "health.painter.gl");
 
-const checkItem = (one, large, speakRemedy) => html`<li data-check=${one.name} data-ok=${one.ok}>
-  <b>${one.ok ? (one.known ? "✓" : "–") : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>
-  ${one.known ? html`<small>${t("health.limit", { limit: one.limit })}</small>` : nothing}
-  ${one.ok ? nothing : html`<p class="bad" ?data-large=${large}>${one.remedy}</p> ${speakButton(one, speakRemedy)}`}
+const checkItem = (check, large, speakRemedy) => html`<li data-check=${check.name} data-ok=${check.ok}>
+  <b>${check.ok ? (check.known ? "✓" : "–") : "✕"} ${t(`health.${check.name}`)}</b> <span>${check.value}</span>
+  ${check.known ? html`<small>${t("health.limit", { limit: check.limit })}</small>` : nothing}
+  ${check.ok ? nothing : html`<p class="bad" ?data-large=${large}>${check.remedy}</p> ${speakButton(check, speakRemedy)}`}
 </li>`;
 
-function speakButton(one, speakRemedy) {
+function speakButton(check, speakRemedy) {
   const able = voiceFor("en") !== null;
-  const words = t(able ? "health.say" : "health.read", { name: t(`health.${one.name}`) });
-  return html`<button type="button" @click=${() => speakRemedy(one)}>${icon(able ? "loud" : "read")} <span>${words}</span></button>`;
+  const words = t(able ? "health.say" : "health.read", { name: t(`health.${check.name}`) });
+  return html`<button type="button" @click=${() => speakRemedy(check)}>${icon(able ? "loud" : "read")} <span>${words}</span></button>`;
 }

@@ -154,9 +154,9 @@ function progressBar(share) {
     <b>${t("unit.percent", { v: number(100 * share, 0) })}</b></div>`;
 }
 
-function errorBox(one) {
-  if (!one) return nothing;
-  return html`<div class="alert" role="alert" data-code=${one.code}><p>${errorText(one)}</p></div>`;
+function errorBox(error) {
+  if (!error) return nothing;
+  return html`<div class="alert" role="alert" data-code=${error.code}><p>${errorText(error)}</p></div>`;
 }
 
 // Return problem, remedy and the updater's message, which holds versions and numbers.
@@ -189,7 +189,7 @@ function choices(status, waiting, sent, actions) {
   return html`
     ${empty ? headline("update.nothing") : nothing}
     ${waiting ? html`<p id="unsent">${t("update.unsent", { count: waiting })} ${t("update.unsent.safe")}</p>` : nothing}
-    ${status.found.length ? html`<ul class="checks">${status.found.map((one) => bundleItem(status, one, actions))}</ul>` : nothing}
+    ${status.found.length ? html`<ul class="checks">${status.found.map((bundle) => bundleItem(status, bundle, actions))}</ul>` : nothing}
     ${status.offered && !status.looked ? paragraph("update.offered", { version: status.offered }) : nothing}
     <p class="muted">${t("update.where")}</p>
     <div class="row">

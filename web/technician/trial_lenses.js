@@ -9,9 +9,9 @@ import { has, number, signed, t } from "../i18n/translate.js";
 
 /** Card that starts the check, for a head with a calibration in force. */
 export function lensCard({ cal, busy }, actions) {
-  const one = cal.in_force;
-  if (!one || one.damaged) return nothing;
-  const offset = one.numbers.trial_offset_dpt;
+  const calibration = cal.in_force;
+  if (!calibration || calibration.damaged) return nothing;
+  const offset = calibration.numbers.trial_offset_dpt;
   const ready = cal.state === "idle" && !busy;
   return html`
     <form class="card start" @submit=${actions.startLenses} aria-labelledby="lenses-title">

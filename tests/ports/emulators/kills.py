@@ -112,15 +112,15 @@ class LitProcess:
                 return self._reaped(KillResult(how, was_lit, float("inf"), MAX_DARK_S))
             time.sleep(STEP_S)
         dark_s = died_s
-        for one in reversed(self._wires.messages):  # the first of the trailing off messages
-            if one["lit"]:
+        for message in reversed(self._wires.messages):  # the first of the trailing off messages
+            if message["lit"]:
                 break
-            dark_s = one["at_s"]
+            dark_s = message["at_s"]
         limit_s = self._sleeper.dark_limit_s(died_s, dark_s)
         return self._reaped(KillResult(how, was_lit, max(0.0, dark_s - died_s) if was_lit else 0.0, limit_s))
 
     def _lit_before(self, moment_s: float) -> dict:
-        earlier = [one for one in self._wires.messages if one["at_s"] <= moment_s]
+        earlier = [message for message in self._wires.messages if message["at_s"] <= moment_s]
         return earlier[-1]["lit"] if earlier else {}
 
     def _reaped(self, death: KillResult) -> KillResult:

@@ -60,7 +60,7 @@ class LoggedChain:
 
     def __call__(self, begin_s: float, end_s: float) -> list[tuple[Illumination | None, float]]:
         """Return the illumination between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
-        changes = [(0.0, None)] + [(one["at_s"], self._illumination(one["lit"])) for one in self.messages]
+        changes = [(0.0, None)] + [(message["at_s"], self._illumination(message["lit"])) for message in self.messages]
         return segments(changes, begin_s, end_s)
 
 

@@ -75,7 +75,7 @@ export class Gestures {
   }
 
   #pinch(id, from, to) {
-    const [other] = [...this.#pointers].filter(([one]) => one !== id).map(([, at]) => at);
+    const [other] = [...this.#pointers].filter(([pointerId]) => pointerId !== id).map(([, at]) => at);
     const factor = distance(to, other) / distance(from, other);
     this.#viewer.panBy((to[0] - from[0]) / 2, (to[1] - from[1]) / 2);
     if (Number.isFinite(factor)) this.#viewer.zoomBy(factor, (to[0] + other[0]) / 2, (to[1] + other[1]) / 2);

@@ -57,7 +57,7 @@ export class PictureViewer extends HTMLElement {
     this.append(this.#canvas, this.#message);
     pictureRenderer().addEventListener("changed", this.#onChange);
     document.addEventListener("visibilitychange", this.#onChange);
-    for (const name of EARLY_PROPERTIES.filter((one) => Object.hasOwn(this, one))) {
+    for (const name of EARLY_PROPERTIES.filter((property) => Object.hasOwn(this, property))) {
       const value = this[name]; // set by the page before this module was loaded
       delete this[name];
       this[name] = value;
