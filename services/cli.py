@@ -1,5 +1,6 @@
 """Command line `diffuscope`: each command parses its arguments and calls one function."""
 
+import gc
 import json
 import os
 import subprocess
@@ -849,6 +850,8 @@ def main(words: list[str] | None = None, program: typer.Typer = app, name: str |
     For a DiffuscopeError, or a command that needs an extra (`instrument`, `archive`) which is not installed, print the
     message and its remedy to stderr and exit with status 2.
     """
+    if words is None:  # in a process of its own: what was imported is no garbage, and each collection would search it
+        gc.freeze()
     try:
         program(words, prog_name=name)
     except DiffuscopeError as error:

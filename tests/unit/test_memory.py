@@ -40,3 +40,11 @@ def test_the_server_starts_without_the_package_of_a_calibration() -> None:
     asks = "import sys, services.http.server; print('scipy.optimize' in sys.modules, 'scipy.fft' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "False True\n"
+
+
+def test_a_command_does_not_search_what_it_imported_for_garbage() -> None:
+    """Collections during a reconstruction would search the 200 000 objects of its packages each time."""
+    asks = "import atexit, gc, sys; sys.argv[1:] = ['--version']; atexit.register(lambda: print(gc.get_freeze_count()))"
+    words = [sys.executable, "-c", f"{asks}; from services.cli import main; main()"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert int(done.stdout.splitlines()[-1]) > 50_000
