@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.project_files import ROOT
 
 FREED = """
@@ -15,19 +17,20 @@ def resident_mb():
 
 if {called}:
     return_freed_arrays()
-np.ones(1 << 20)  # 8 MB: once freed, glibc keeps arrays of this size in its heap
+np.ones({frame})  # once freed, glibc keeps arrays of this size in its heap
 before = resident_mb()
-arrays = [np.ones(1 << 20) for _ in range(20)]
+arrays = [np.ones({frame}) for _ in range(20)]
 del arrays[:19]
 print(round(resident_mb() - before))
 """
 
 
-def kept_mb(called: bool) -> int:
-    words = [sys.executable, "-c", FREED.format(called=called)]
+def kept_mb(frame: str, called: bool) -> int:
+    words = [sys.executable, "-c", FREED.format(frame=frame, called=called)]
     return int(subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout)
 
 
-def test_the_memory_of_freed_arrays_returns_to_the_system() -> None:
-    assert kept_mb(called=True) < 16, "8 MB are in use"
-    assert kept_mb(called=False) > 100, "the default of glibc, without which the call is superfluous"
+@pytest.mark.parametrize(("frame", "frame_mb"), [("(1080, 1920), np.float32", 8), ("(1080, 1920), np.uint16", 4)])
+def test_the_memory_of_freed_frames_returns_to_the_system(frame: str, frame_mb: int) -> None:
+    assert kept_mb(frame, called=True) < 2 * frame_mb, "one frame is in use"
+    assert kept_mb(frame, called=False) > 12 * frame_mb, "the default of glibc, without which the call is superfluous"
