@@ -12,6 +12,8 @@ from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import Grid, Pair, support_radius_px
 from device.values import Calibration, Image, Psf
 
+ROWS = 64  # of a PSF that are transformed at a time: all at once would take 36 MB for a moment
+
 
 class Model:
     """Forward model of one PSF on one grid: planned FFT, OTF, field mask, and the blurred field on the sensor.
@@ -110,9 +112,13 @@ def otf(psf: Psf, grid: Grid) -> Spectrum:
     """
     n = grid.n
     (rows, cols) = grid.shape
-    fine = scipy_fft.rfft2(wrapped(psf, (rows * n, cols * n)).astype(np.float64))
+    torus = wrapped(psf, (rows * n, cols * n))
+    fine = np.empty((rows * n, cols // 2 + 1), np.complex128)  # low frequencies along the columns, all along the rows
+    for begin in range(0, rows * n, ROWS):
+        part = slice(begin, begin + ROWS)
+        fine[part] = scipy_fft.rfft(torus[part].astype(np.float64))[:, : cols // 2 + 1]
     down = np.fft.fftfreq(rows, 1 / rows).astype(int)
-    low = fine[down][:, : cols // 2 + 1]
+    low = scipy_fft.fft(fine, axis=0, overwrite_x=True)[down]
     kernel = np.outer(dirichlet(np.fft.fftfreq(rows), n), dirichlet(np.fft.rfftfreq(cols), n))
     return np.asarray(low * kernel / low[0, 0].real, np.complex64)
 
