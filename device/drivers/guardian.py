@@ -17,6 +17,7 @@ from device.errors import LightFault
 log = logging.getLogger(__name__)
 
 ANSWER_S = 0.5  # a guardian that answers later would also darken the ring too late
+START_S = 10.0  # to start the process on a busy computer, before any light
 DARKEN_S = 2.0
 BLANK = Path(__file__).with_name("blank.py")
 
@@ -25,7 +26,8 @@ class Guardian:
     """Handle of the child process `blank.py --guard`, which receives leases and acknowledges each.
 
     `device` is the SPI device, `chip` what its chain is made of, `leds` its length if these are APA102. Every message
-    raises LightFault if the child has ended or does not answer within 0.5 s; then no light may be turned on.
+    raises LightFault if the child has ended or does not answer within 0.5 s, at its start within 10 s; then no light
+    may be turned on.
     """
 
     def __init__(self, device: str, leds: int = LEDS, chip: Literal["apa102", "tlc5971"] = "apa102") -> None:
@@ -39,7 +41,7 @@ class Guardian:
         ends = [Thread(target=wait_for_end, args=(self.pid,), name="guardian", daemon=True) for _ in range(2)]
         for thread in ends:
             thread.start()
-        if self._send(f"watch {ends[0].native_id} {ends[1].native_id}\n") != b"ok\n":
+        if self._send(f"watch {ends[0].native_id} {ends[1].native_id}\n", START_S) != b"ok\n":
             log.info("this kernel is older than Linux 6.9: after a kill the lamp may be dark later on a busy computer")
         if not self.is_real_time:
             log.info("the lamp's guardian has no real-time priority: on a busy computer the lamp may be dark later")
@@ -85,12 +87,12 @@ class Guardian:
     ) -> None:
         self.close()
 
-    def _send(self, words: str) -> bytes:
+    def _send(self, words: str, limit_s: float = ANSWER_S) -> bytes:
         assert self._child.stdin is not None
         assert self._child.stdout is not None
         try:
             self._child.stdin.write(words.encode("ascii"))
-            ready, _, _ = select.select([self._child.stdout], [], [], ANSWER_S)
+            ready, _, _ = select.select([self._child.stdout], [], [], limit_s)
             answer = self._child.stdout.read(64) if ready else b""
         except OSError as error:
             raise LightFault(f"the lamp's guardian is gone: {error}") from error
