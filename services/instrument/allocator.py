@@ -8,7 +8,7 @@ thread has a heap of its own.
 import ctypes
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8  # the parameters of `mallopt` in malloc.h
-MAPPED_BYTES = 1 << 21  # counts of 2 MP take 4.1 MB; grids of samples less, and are used again within the heaps
+MAPPED_BYTES = 4_000_000  # counts of 2 MP take 4.1 MB; grids of samples less, and are used again within the heaps
 
 
 def return_freed_arrays() -> None:
