@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -94,13 +94,17 @@ gate: $(GATE_ROOT)/ready ## Check schematic (ERC) and boards (DRC) of gate and r
 JOURNEYS := tests/browser/test_page.py
 # What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below six minutes.
 FAULTS := tests/hard tests/physics tests/property
-# Whole calibrations, every fault of every part, interruptions, restored backups, montages and every scene.
+# Whole calibrations, every fault of every part, interruptions, restored backups, updates, montages, every scene, and what
+# starts a process for each of many cases.
 INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibration_session.py test_calibration_monitor.py test_calibration_faults.py \
 	test_calibrate_command.py test_calibrations_command.py test_interrupted_press.py \
 	test_accuracy_explorer.py test_backup_page.py test_shutdown.py test_upload.py \
-	test_store_refusal_after_light.py test_visit_montage.py test_visit_export.py) \
+	test_store_refusal_after_light.py test_visit_montage.py test_visit_export.py test_visit_colour.py \
+	test_reconstruct_burst.py test_updates.py test_openapi.py test_cli_server.py test_core_installation.py \
+	test_frontier.py) \
 	$(addprefix tests/unit/,test_calibration_sequence.py test_calibration_measurements.py test_head_check.py test_trial_lenses.py \
-	test_damaged_rows.py test_montage.py test_backup.py test_effects.py test_scene_files.py)
+	test_damaged_rows.py test_montage.py test_backup.py test_effects.py test_scene_files.py \
+	test_paper_report.py)
 NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
 # Workers take file after file in the order given: what takes long comes first, so that no worker begins it when the
 # others end. pytest drops a file that is named beside its folder, so that each is named once.
@@ -114,8 +118,10 @@ LONG_PAGES := $(addprefix tests/browser/,test_calibration_wizard.py test_softwar
 LONG_GOLDEN := $(addprefix tests/golden/,test_golden_http.py test_golden_files.py test_golden_cli.py test_golden_exam.py)
 tests_of = $(wildcard $(addsuffix /test_*.py,$(1)))
 
-test: .venv/kernels browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
+test: .venv/kernels browser ## Run the tests that a change needs first: units, instrument, server, a press on the page.
 	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) $(filter-out $(INSTRUMENT_FAULTS),$(call tests_of,tests/journey tests tests/unit))
+
+test-ports: .venv/kernels buses ## Run the contract suites of drivers and simulated parts on emulated buses.
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
 test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, faults of every part, optics and invariants.
