@@ -356,7 +356,8 @@ def test_every_connection_is_durable_and_the_tables_are_strict(store: CaptureSto
             for pragma, value in {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1}.items():
                 assert connection.exec_driver_sql(f"PRAGMA {pragma}").scalar() == value
             assert connection.exec_driver_sql("PRAGMA busy_timeout").scalar() >= 1000
-        strict = {name: flag for name, flag in first.exec_driver_sql("SELECT name, strict FROM pragma_table_list")}  # noqa: C416
+        rows = first.exec_driver_sql("SELECT name, strict FROM pragma_table_list")
+        strict = {row.name: row.strict for row in rows}
     engine.dispose()
     assert {strict[table.name] for table in schema.Base.metadata.sorted_tables} == {1}
 
