@@ -299,33 +299,15 @@ def health(
     look: Annotated[bool, typer.Option("--look", help="Also take a live picture, which shines for a moment.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the list for a program.")] = False,
 ) -> None:
-    """Ask the running instrument whether it could take a picture now; the exit status is 1 if a check fails."""
+    """Operator, while the page is open: could the running instrument take a picture now?
+
+    The exit status is 1 if a check fails.
+    """
     from services.health import probe
 
     checks = probe.probe_instrument(at, look)
     typer.echo(json.dumps(probe.as_json(checks), indent=1) if as_json else probe.table(checks))
     raise typer.Exit(0 if all(check.ok for check in checks) else 1)
-
-
-@app.command("probe")
-@announced("probing the head")
-def probe_head(
-    head: Annotated[Path, typer.Option(callback=_head_file, help="Head file, or the name of a shipped one: imx296.")],
-) -> None:
-    """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips.
-
-    The lamp shines, and its light is not counted for an eye: point the head at white paper. The exit status is 1 if a
-    part is not well.
-    """
-    from device.head import probe
-
-    well = True
-    for found in probe(load_head(head), SystemClock()):
-        well &= found.ok
-        typer.echo(f"{'ok  ' if found.ok else 'FAIL'}  {found.part:<14} {found.reading}")
-        if found.remedy:
-            typer.echo(f"{'':<22}{found.remedy}")
-    raise typer.Exit(0 if well else 1)
 
 
 @app.command("doctor")
@@ -335,17 +317,23 @@ def examine_computer(
         Path | None,
         typer.Option(callback=_head_file, help="Head file; its parts are opened, without light."),
     ] = None,
-    leds: Annotated[bool, typer.Option("--leds", help="Also light each LED: point the head at white paper.")] = False,
+    parts: Annotated[
+        bool, typer.Option("--parts", help="Builder of a head: also test each LED, lit before white paper.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
 ) -> None:
-    """What this computer lacks for a head, each with its remedy: buses, permissions, libraries, camera, lamp, chips.
+    """Maker, before the first picture: what does this computer lack for a head?
 
-    The exit status is 1 if a check failed; a warning does not count.
+    Buses, permissions and libraries, each with its remedy; with --head also camera, lamp and chips. With --parts every
+    LED shines, and its light is not counted for an eye. The exit status is 1 if a check failed; a warning does not
+    count.
     """
     from services.health import doctor
 
+    if parts and head is None:
+        raise typer.BadParameter("--parts are those of a head: give its file or name with --head")
     spec = None if head is None else load_head(head)
-    report = doctor.examine(doctor.Machine(SystemClock(), leds=leds), spec)
+    report = doctor.examine(doctor.Machine(SystemClock(), leds=parts), spec)
     typer.echo(report.model_dump_json(indent=1) if as_json else doctor.table(report))
     raise typer.Exit(0 if report.healthy else 1)
 
@@ -543,7 +531,7 @@ def check_head(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="With --model-eye: as JSON.")] = False,
 ) -> None:
-    """Ask whether the calibration in force still fits the head: after a drop, or when pictures look odd.
+    """Technician, after a drop or odd pictures: does the calibration in force still fit the head?
 
     The last captures tell; without any, dark frames are taken now. With --model-eye the printed retina of
     hardware/model-eye.md gives resolution, scale, field and light. The exit status is 1 if a finding fails.

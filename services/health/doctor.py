@@ -141,7 +141,7 @@ def gate(machine: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFindin
 
 
 def parts(machine: Machine, spec: InstrumentSpec | None) -> Iterator[DoctorFinding]:
-    """Yield the findings of `diffuscope probe`: lamp, camera, black level, mosaic, chips, and LEDs if asked for."""
+    """Yield the findings on lamp, camera, black level, mosaic and chips, and on each LED with `--parts`."""
     if spec is None or spec.camera.backend == "replay":
         return
     for found in probe(spec, machine.clock, leds=machine.leds):

@@ -38,8 +38,7 @@ TOO_BRIGHT = "\n".join(
 )
 Words = tuple[str, list[str], str | None]  # command, arguments, what is typed; None: killed once the ring was lit
 LIT: tuple[Words, ...] = (  # every command that lights the ring of a head
-    ("probe", ["--head", "HEAD"], ""),
-    ("doctor", ["--head", "HEAD", "--leds"], ""),
+    ("doctor", ["--head", "HEAD", "--parts"], ""),
     ("meter", ["--head", "HEAD", "--seconds", "0.1", "--data", "DATA"], "y\n0.1\n"),
     ("check", ["--head", "HEAD", "--model-eye", "--archive", "ARCHIVE", "--exposure-s", "0.01"], None),
     ("trial-lenses", ["--head", "HEAD", "--archive", "ARCHIVE"], None),
@@ -96,7 +95,6 @@ WITHOUT_HEAD = {  # files, stores, simulated scenes: no part of a head is opened
 }
 OPENERS = {"open_head", "open_bench", "open_light", "head_memory", "probe", "HeadOpener"}  # of device/head.py
 OPENING = {  # every module outside device/head.py that calls one of them, and its commands
-    "services/cli.py": "probe",
     "services/health/doctor.py": "doctor",
     "services/workshop/power_meter.py": "meter",
     "services/workshop/model_eye.py": "check",

@@ -1,4 +1,4 @@
-"""`diffuscope probe` on emulated parts: each present part is listed, each missing part has a remedy."""
+"""`diffuscope doctor --parts` on emulated parts: each present part is listed, each missing part has a remedy."""
 
 import libcamera
 import pytest

@@ -581,7 +581,6 @@ COMMANDS = {  # commands that write pictures; the others print, draw plots, or m
 }
 OTHER_COMMANDS = {
     "health",
-    "probe",
     "doctor",
     "meter",
     "light",

@@ -112,6 +112,20 @@ def test_the_command_prints_json_and_fails_where_something_is_missing() -> None:
     assert report.head == load_head(BENCH).name
 
 
+def test_the_parts_are_those_of_a_head() -> None:
+    called = CliRunner().invoke(app, ["doctor", "--parts"])
+    assert (called.exit_code, called.stdout) == (2, "")
+    assert "--head" in called.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "asks"), [("doctor", "Maker, "), ("check", "Technician, "), ("health", "Operator, ")]
+)
+def test_the_help_of_a_command_about_health_begins_with_its_reader(command: str, asks: str) -> None:
+    called = CliRunner().invoke(app, [command, "--help"])
+    assert called.stdout.split("[OPTIONS]")[1].strip().startswith(asks)
+
+
 def test_a_bench_head_is_real_and_has_no_lamp() -> None:
     spec, clock = load_head(BENCH), SystemClock()
     assert (is_simulated(spec), kind_of(spec)) == (False, "real")
