@@ -6,13 +6,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Page, expect
 
 from tests.browser.alert_causes import CAUSES, StandingAlerts, alert, cut_power
+from tests.browser.axe import axe_faults
 from tests.browser.conftest import Complaints, MakeReal
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Instruments, Real
-from tests.browser.walk import SHUTTER, Open, after_debounce, aiming, set_language, tap, wait_for_preview
+from tests.browser.walk import SHUTTER, Open, after_debounce, aiming, switch_language, tap, wait_for_preview
 from tests.journey.conftest import until
 
 pytestmark = pytest.mark.browser
@@ -198,40 +199,50 @@ def test_power_loss_alert_without_visits(
     expect(page.locator(".notices")).to_have_count(0)
 
 
-@pytest.mark.parametrize(
-    ("size", "language"), [("phone", "ta"), ("small", "en-XA"), ("portrait", "te"), ("tablet", "hi")]
-)
-def test_every_alert_fits_in_longest_texts(
-    open_page: Open, real: Real, standing_alerts: StandingAlerts, complaints: Complaints, size: str, language: str
+LONGEST = {"phone": "ta", "small": "en-XA", "portrait": "te", "tablet": "hi"}  # language with long texts, by size
+
+
+def look_everywhere(page: Page, *in_view: str) -> list[str]:
+    """Return the violations of `look_for_faults` in the sizes and languages of LONGEST, and those of axe-core."""
+    faults = []
+    for size, language in LONGEST.items():
+        width, height = SIZES[size]
+        page.set_viewport_size({"width": width, "height": height})
+        switch_language(page, language)
+        faults += [f"{size} {language}: {fault}" for fault in look_for_faults(page, *in_view)]
+    faults += [f"axe: {fault}" for fault in axe_faults(page)]
+    page.locator("[data-link=live]").wait_for()  # axe blocks the page long enough to miss heartbeats
+    return faults
+
+
+def test_every_alert_fits_in_longest_texts_without_axe_violation(
+    open_page: Open, real: Real, standing_alerts: StandingAlerts, complaints: Complaints
 ) -> None:
     complaints.expect("409")
-    page = open_page("about:blank", SIZES[size])
-    set_language(page, language)
+    page = open_page("about:blank")
     visit = real.begin_visit(consent="agreed", sex="woman", age=54)
-    page.goto(f"{real.url}/#/visit/{visit['id']}/aim/R-centre")
-    page.wait_for_selector("eye-live[data-frame]")
     faults: dict[str, list[str]] = {}
     for code in StandingAlerts.CODES:
         standing_alerts.open(page, code)
-        faults[code] = look_for_faults(page, SHUTTER)
+        faults[code] = look_everywhere(page, SHUTTER)
     page.goto(f"{real.url}/#/visit/{visit['id']}/aim/R-centre")
     page.wait_for_selector("eye-live[data-frame]")
     for code in CAUSES:
         with alert(real, page, code):
-            faults[code] = look_for_faults(page, SHUTTER)
+            faults[code] = look_everywhere(page, SHUTTER)
     assert faults.keys() == {*BLOCKING, *ADVISORY}
     real.show("saturated")
     real.hold = "stored"
     page.locator(SHUTTER).tap()
     page.wait_for_selector("[data-phase=assessed]")
-    faults["assessed"] = look_for_faults(page, "#again")
+    faults["assessed"] = look_everywhere(page, "#again")
     real.hold = None
     page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
-    faults["again"] = look_for_faults(page, "#again", "#keep")
+    faults["again"] = look_everywhere(page, "#again", "#keep")
     for place in ("patient", "pictures", "outcome"):
         page.goto(f"{real.url}/#/visit/{visit['id']}/{place}")
         page.wait_for_selector(f".{place}")
-        faults[place] = look_for_faults(page)
+        faults[place] = look_everywhere(page)
     assert {name: found for name, found in faults.items() if found} == {}
 
 

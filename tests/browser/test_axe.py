@@ -1,11 +1,9 @@
-"""axe-core checks of every screen and alert of the exam page; the tests of the technician page run axe too."""
+"""axe-core checks of every screen of the exam page; `test_alerts` checks the alerts."""
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.alert_causes import CAUSES, StandingAlerts, alert
 from tests.browser.axe import axe_faults
-from tests.browser.conftest import Complaints
 from tests.browser.real import Real
 from tests.browser.walk import SHUTTER, Open, aiming, finish_early, take_picture, tap
 
@@ -92,23 +90,14 @@ def test_no_axe_violation_during_capture_and_verdict(open_page: Open, real: Real
     axe.assert_clean(7)
 
 
-def test_no_axe_violation_in_any_alert(
-    open_page: Open, real: Real, standing_alerts: StandingAlerts, complaints: Complaints
-) -> None:
-    complaints.expect("409")
+def test_no_axe_violation_in_any_hint(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     axe = AxeRun(page)
-    for code in CAUSES:
-        with alert(real, page, code):
-            axe.check(code, f"[data-code='{code}']")
     for hint, (words, show) in HINTS.items():
         show(real)
         expect(page.locator(".prompt")).to_contain_text(words)
         axe.check(f"aim.{hint}", "eye-live[data-frame]")
-    for code in StandingAlerts.CODES:
-        standing_alerts.open(page, code)
-        axe.check(code, f"[data-code='{code}']")
-    axe.assert_clean(24)
+    axe.assert_clean(3)
 
 
 def test_axe_detects_violations_in_both_themes(open_page: Open, real: Real) -> None:

@@ -103,3 +103,17 @@ def loupe_position(pic: Locator) -> tuple[float, float]:
 def set_language(page: Page, language: str) -> None:
     """Set the language of all pages of this context."""
     page.context.add_init_script(f"localStorage.setItem('diffuscope.language', '{language}')")
+
+
+def switch_language(page: Page, language: str) -> None:
+    """Switch the language of an open page, as the buttons of the home screen do, and wait for the new layout."""
+    page.evaluate(
+        """async (language) => {
+          const entry = document.querySelector("script[type=module]").src;
+          const { actions } = await import(new URL("core/actions.js", entry).href);
+          await actions.setLanguage(language);
+          await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
+        }""",
+        language,
+    )
+    expect(page.locator("html")).to_have_attribute("lang", language)
