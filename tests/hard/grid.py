@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from device.errors import SettingError
 from services.research.reconstruct_file import write_or_raise
 from tests.hard.cases import CASES, CLEAN, NAMED
-from tests.hard.cells import COLUMNS, CaseRunner, Cell
+from tests.hard.cells import COLUMNS, DEFAULT_SCHEDULE, CaseRunner, Cell
 from tests.hard.frames import Eye
 from tests.hard.judgement import Violation, covered, violations
 from tests.hard.picture import draw_grid, explanations, table
@@ -19,6 +19,24 @@ EYES = (
     Eye("relaxed eye, paper's sensor", "sim", {"sim.seed": 1}),
     Eye("short-sighted eye, paper's sensor", "sim", {"sim.seed": 7, "sim.eye.m_dpt": 2.5}),
     Eye("long-sighted eye, IMX296", "imx296", {"sim.seed": 5, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}),
+)
+QUICK_MERGED, QUICK_COLUMNS = 4, (DEFAULT_SCHEDULE, "gradient")  # of one eye: within a minute on a laptop
+QUICK = (
+    "1.0% saturated",
+    "glare, 0.3 % clipped",
+    "dead columns, declared",
+    "dead columns, 0 DN",
+    "dead blob, declared",
+    "dead blob, 0 DN",
+    "warm, 0.10% + 1500 DN",
+    "100 e- peak",
+    "eye off by +2 dpt",
+    "PSF of another head",
+    "half a lid",
+    "1 % NaN",
+    "all zeros",
+    "constant",
+    "black level off by 20 DN",
 )
 ProgressCallback = Callable[[str], None]
 
@@ -118,4 +136,4 @@ def summary(found: HardCases) -> str:
         f"* {violation.rule}: {violation.eye}; {violation.case}; {violation.method}: {violation.words}"
         for violation in found.violations
     ]
-    return "\n".join([*lines, f"{len(found.violations)} violations in {len(found.cells)} cells"])
+    return "\n".join([*lines, f"{len(found.violations)} violations of {len(found.cells)} cells"])

@@ -14,27 +14,10 @@ from services.research.reconstruct_file import OutputFiles, reconstruct_file
 from tests.hard.cases import CASES, CLEAN, NAMED
 from tests.hard.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
 from tests.hard.frames import Eye
-from tests.hard.grid import run
+from tests.hard.grid import QUICK, QUICK_MERGED, run
 from tests.hard.judgement import KINDS, covered, kind, violations
 
-EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
-REDUCED = (
-    "1.0% saturated",
-    "glare, 0.3 % clipped",
-    "dead columns, declared",
-    "dead columns, 0 DN",
-    "dead blob, declared",
-    "dead blob, 0 DN",
-    "warm, 0.10% + 1500 DN",
-    "100 e- peak",
-    "eye off by +2 dpt",
-    "PSF of another head",
-    "half a lid",
-    "1 % NaN",
-    "all zeros",
-    "constant",
-    "black level off by 20 DN",
-)
+EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=QUICK_MERGED)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +30,7 @@ def clean(grid: CaseRunner) -> list[Cell]:
     return grid.cells(CLEAN)
 
 
-@pytest.mark.parametrize("key", REDUCED)
+@pytest.mark.parametrize("key", QUICK)
 def test_a_hard_case_keeps_its_bound_or_is_reported(
     key: str, grid: CaseRunner, clean: list[Cell], record_property: Callable[[str, object], None]
 ) -> None:
