@@ -4,6 +4,7 @@ import json
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Lock
 from typing import Any, TypeVar
 
 from device.clock import Clock
@@ -21,7 +22,10 @@ Read = TypeVar("Read")
 
 
 class I2cBus:
-    """I2C bus, opened through smbus2; an error of the bus is raised as a BusFault that names the chip or the bus."""
+    """I2C bus, opened through smbus2; an error of the bus is raised as a BusFault that names the chip or the bus.
+
+    Several threads may read: a lock is held over each word, as the chip's address is a state of the opened device.
+    """
 
     def __init__(self, device: str) -> None:
         try:
@@ -31,6 +35,7 @@ class I2cBus:
                 f"smbus2 cannot be used: {error}", "Install it: sudo apt install python3-smbus2, then make pi."
             ) from error
         self._message = i2c_msg
+        self._address_lock = Lock()
         try:
             self._bus: Any = SMBus(device)
         except OSError as error:
@@ -38,7 +43,7 @@ class I2cBus:
 
     def read_word(self, address: int, register: int) -> int:
         """Return the value of a 16-bit register, which the chip transmits high byte first."""
-        with _bus_faults(f"chip {address:#04x}"):
+        with self._address_lock, _bus_faults(f"chip {address:#04x}"):
             low_first = int(self._bus.read_word_data(address, register))
         return (low_first & 0xFF) << 8 | low_first >> 8
 

@@ -1,7 +1,7 @@
 """Status of the instrument as values: states and errors, readings of the chips, and interrupted captures.
 
 The only module that reads the parts of the head for health checks and alerts. Reading a chip takes bus transfers, which
-the kernel serialises with those of the exam loop. It neither switches the lamp on nor changes a setting of the head.
+the driver serialises with those of the exam loop. It neither switches the lamp on nor changes a setting of the head.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,7 @@
 """Contract of every Thermometer, Battery and HeadMemory, simulated or over an emulated I2C bus (device/ports.py)."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
@@ -15,6 +16,7 @@ from device.values import BatteryState, HeadIdentity
 from tests.ports.conftest import small_head
 from tests.ports.emulators.wires import emulated_buses
 
+READS = 300  # of each chip; a shared address was seen wrong within ten
 IDENTITY = HeadIdentity("DS-0042", "9f" * 32)
 
 
@@ -64,6 +66,14 @@ def test_the_thermometer_returns_degrees_celsius(chips):
 
 def test_the_battery_returns_charge_and_voltage(chips):
     assert chips.battery.read() == BatteryState(pytest.approx(0.775, abs=0.002), pytest.approx(3.88, abs=0.01))
+
+
+def test_chips_that_two_threads_read_at_once_do_not_answer_for_one_another(chips):
+    """The page asks for the health while a press reads the same chips."""
+    with ThreadPoolExecutor(2) as threads:
+        warm = threads.submit(lambda: {chips.thermometer.read_c() for _ in range(READS)})
+        charge = threads.submit(lambda: {round(chips.battery.read().fraction, 3) for _ in range(READS)})
+    assert (warm.result(), charge.result()) == ({25.0}, {0.775})
 
 
 def test_the_memory_stores_the_identity_of_the_head(chips):
