@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers readme parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers readme parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -43,6 +43,13 @@ $(UV):
 
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
+
+# HEAD: a head file with real drivers; DO: the words of another command, which needs no other settings than --head.
+HEAD ?= tests/ports/emulators/heads/emulated.toml
+DO ?= run --port $(PORT) --data out/emulated
+
+run-emulated: .venv/ready buses ## Serve the page with real drivers over emulated buses, whose bytes are printed; DO="doctor --parts".
+	@umockdev-wrapper $(BIN)/python -m tests.ports.emulators.launch $(DO) --head $(HEAD)
 
 # Debian's drivers lie behind .venv's own packages on the path, so that NumPy stays that of the lock file; those that only
 # the tests' emulators need are taken out, as they would hide Debian's.

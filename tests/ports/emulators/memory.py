@@ -36,3 +36,8 @@ class MemoryAllocator(Allocator):
         for fd in self._fds:
             os.close(fd)
         self._fds, self._buffers = [], {}
+
+
+def allocate_in_memory() -> None:
+    """Let each Picamera2 of this process allocate here by default, as it does from a kernel's dma-heap on a Pi."""
+    picamera2.picamera2.DmaAllocator = MemoryAllocator

@@ -3,10 +3,13 @@
 import atexit
 import json
 import os
+import shutil
 import subprocess
 import tempfile
+from bisect import bisect_right
 from collections.abc import Callable
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 
 from device.config.head_file import SinkLedSpec, SinkSpec
@@ -37,20 +40,36 @@ SINKS = SinkSpec(  # the ring of imx296_power.toml on the second bus, with 60 mA
 )
 
 
+class LogTail:
+    """Reader of a growing file of JSON lines: each call returns the whole lines that are new."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._read = path, 0
+
+    def __call__(self) -> list[dict]:
+        if not self._path.exists():
+            return []
+        with self._path.open("rb") as file:
+            file.seek(self._read)
+            text = file.read()
+        whole = text[: text.rfind(b"\n") + 1]
+        self._read += len(whole)
+        return [json.loads(line) for line in whole.splitlines()]
+
+
 class LoggedChain:
     """LEDs on one emulated SPI bus: its messages so far, and what is lit, from the log of the buses."""
 
     def __init__(self, log: Path, illumination: Callable[[dict], Illumination | None]) -> None:
-        self._log, self._illumination = log, illumination
-        self._read, self._seen = 0, []
+        self._illumination = illumination
+        self._messages, self._lit = LogTail(log), LogTail(log)
+        self._seen: list[dict] = []
+        self._changes: list[tuple[float, Illumination | None]] = [(0.0, None)]
 
     @property
     def messages(self) -> list[dict]:
         """Return all SPI messages so far: `at_s`, `hz`, `bytes`, `lit` after the message."""
-        text = self._log.read_text(encoding="ascii") if self._log.exists() else ""
-        whole = text[: text.rfind("\n") + 1]
-        self._seen += [json.loads(line) for line in whole[self._read :].splitlines()]
-        self._read = len(whole)
+        self._seen += self._messages()
         return self._seen
 
     @property
@@ -60,8 +79,9 @@ class LoggedChain:
 
     def __call__(self, begin_s: float, end_s: float) -> list[tuple[Illumination | None, float]]:
         """Return the illumination between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
-        changes = [(0.0, None)] + [(message["at_s"], self._illumination(message["lit"])) for message in self.messages]
-        return segments(changes, begin_s, end_s)
+        self._changes += [(message["at_s"], self._illumination(message["lit"])) for message in self._lit()]
+        first = bisect_right(self._changes, begin_s, key=itemgetter(0)) - 1
+        return segments(self._changes[first:], begin_s, end_s)
 
 
 class EmulatedBuses(LoggedChain):
@@ -79,7 +99,10 @@ class EmulatedBuses(LoggedChain):
         self.sinks = LoggedChain(self.folder / "sinks.jsonl", sink_illumination)
         plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
         command = ["/usr/bin/python3", str(SERVE), str(self.folder)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=plain)
+        # Ctrl-C in a terminal must not end the buses before the instrument, which darkens its ring over them.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=plain, start_new_session=True
+        )
         atexit.register(self._end)
         assert self._process.stdout is not None
         os.environ["UMOCKDEV_DIR"] = self._process.stdout.readline().strip()
@@ -95,9 +118,8 @@ class EmulatedBuses(LoggedChain):
 
     def _end(self) -> None:
         self._process.kill()
-        self._process.wait()
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+        self._process.communicate()
+        shutil.rmtree(self.folder)
 
 
 def sink_illumination(lit: dict[str, float]) -> Illumination | None:

@@ -203,4 +203,6 @@ testbed.attach_ioctl("/dev/spidev1.0", Spi(Sinks, "sinks.jsonl"))
 chips = {0x48: Words({0: 0x0C80, 15: 0x0117}), 0x36: Words({2: 0xC200, 4: 0x4D80}), 0x50: Eeprom()}
 testbed.attach_ioctl("/dev/i2c-1", I2c(chips))
 print(testbed.get_root_dir(), flush=True)
-GLib.MainLoop().run()
+loop = GLib.MainLoop()
+GLib.io_add_watch(0, GLib.IO_HUP, loop.quit)  # of standard input: this process ends with the one that started it
+loop.run()
