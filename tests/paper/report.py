@@ -167,7 +167,7 @@ def table(ran: Sequence[ExperimentRun]) -> str:
         for claim in run.outcome.claims:
             mark = MARKS[claim.status]
             lines.append(
-                f"{run.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
+                f"{run.experiment.key:<5}{mark:<4}{claim.what:<62}{printed_value(claim):>10}  {claim.limit:<18}"
                 f"{claim.paper}".rstrip()
             )
     return "\n".join(lines)
@@ -229,7 +229,7 @@ def _flags(claims: Sequence[Claim]) -> str:
 
 def _claims(claims: Sequence[Claim]) -> str:
     rows = "".join(
-        f"<tr class={CLASSES[claim.status]}><td>{escape(claim.what)}</td><td class=n>{_value(claim)}</td>"
+        f"<tr class={CLASSES[claim.status]}><td>{escape(claim.what)}</td><td class=n>{printed_value(claim)}</td>"
         f"<td>{escape(claim.limit)}{_limit_note(claim)}</td><td>{claim.status}</td>"
         f"<td>{escape(claim.paper) or '&ndash;'}</td><td>{_label(claim)}</td></tr>"
         for claim in claims
@@ -266,7 +266,7 @@ def _figure(shown: Figure) -> str:
     return f'<figure{kind}><img src="{shown.address}" alt="{words}"><figcaption>{words}</figcaption></figure>'
 
 
-def _value(claim: Claim) -> str:
+def printed_value(claim: Claim) -> str:
     """Return the value in its digits; one that would be printed as zero in scientific notation, zero itself as 0."""
     printed = f"{claim.value:.{claim.digits}f}"
     if float(printed) != 0 or claim.digits == 0:

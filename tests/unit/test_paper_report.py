@@ -1,9 +1,11 @@
 """Report of `diffuscope paper`: failed assertions, self-contained page, refusals, and scenes of the bench."""
 
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from base64 import b64decode
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from device.sim.world import World
 from tests.paper.bench import Bench, with_changes
 from tests.paper.outcome import Experiment, Figure, Outcome, above, attempted, below, within
 from tests.paper.pictures import plane, trend
-from tests.paper.report import EXPERIMENTS, ORDER, ExperimentRun, all_hold, html, run_experiments, table
+from tests.paper.report import EXPERIMENTS, ORDER, ExperimentRun, all_hold, html, printed_value, run_experiments, table
+from tests.paper.results_page import PAGE, kept_values, row
+from tests.project_files import ROOT, text
 
 
 def ran(*claims, **more) -> list[ExperimentRun]:
@@ -175,3 +179,18 @@ def test_change_of_a_scene_is_validated() -> None:
     dots = with_changes(spec, {"sim.object.kind": "dots"})
     with pytest.raises(SpecError, match="half_size_um"):
         _ = World(dots, VirtualClock()).retina
+
+
+def test_the_kept_page_has_the_values_and_labels_of_today() -> None:
+    """The numbers by formula, with each label; the other experiments are run again in test_paper_results.py."""
+    outcome = EXPERIMENTS["N"].labelled(EXPERIMENTS["N"].run(Bench()))
+    page = text(PAGE)
+    assert kept_values(page, "N") == {claim.what: printed_value(claim) for claim in outcome.claims}
+    assert [claim.what for claim in outcome.claims if row(claim) not in page] == []
+    assert re.findall(r"^## (\w+): ", page, re.M) == list(ORDER)
+
+
+def test_the_kept_pictures_are_small() -> None:
+    pictures = re.findall(r"\]\((results/\S+)\)", text(PAGE))
+    assert len(pictures) > 20
+    assert sum((ROOT / PAGE).with_name("results").joinpath(Path(name).name).stat().st_size for name in pictures) < 1.5e6
