@@ -160,7 +160,7 @@ def test_config_txt_is_readable_and_enables_the_head() -> None:
     assert lines[-1] == "[all]", "lines added at the end apply to all boards"
     wanted = {"spi=on", "i2c_arm=on", "strict_gpiod", "watchdog=on"}
     assert wanted <= {line.removeprefix("dtparam=") for line in lines}
-    head = re.search(r"heads\\/(\w+)\.toml/'", text(f"{CARD}/board"))
+    head = re.search(r"echo HEAD=(\w+) >", text(f"{CARD}/board"))
     assert head is not None
     spec = load_head(ROOT / f"hardware/heads/{head[1]}.toml")
     assert spec.camera.backend == "picamera2"

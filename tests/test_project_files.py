@@ -25,12 +25,14 @@ import services.errors
 from device.config.head_file import load_head
 from device.drivers.exposure_retry import FRAME_TIMEOUT_S
 from device.drivers.pi_camera import OPEN_TIMEOUT_S
+from device.errors import SettingError
 from services.cli import app
 from services.health import clock_request
 from services.http.connection_limits import ConnectionLimits
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import BEAT_S
 from services.records.capture import BUDGET_S
+from services.research.named_files import head_file
 from services.update.command import app as update_app
 from services.update.ipc import REQUEST_FILE, TABLET
 from services.update.settings import UpdateSettings
@@ -473,6 +475,19 @@ def test_the_instrument_unit_has_a_valid_command_restart_and_sandboxing() -> Non
     assert service["ProtectSystem"] == "strict"
     assert service["LimitRTPRIO"] == "1"
     assert "MemoryDenyWriteExecute" not in service, "numba compiles at run time, so memory must become executable"
+
+
+def test_the_units_name_no_head_and_their_installer_asks_for_it(tmp_path: Path) -> None:
+    """A device must not simulate because a line was left out: no fallback to a fake."""
+    service = text("systemd/diffuscope.service")
+    assert not re.search(r"^[^#]*(HEAD=|sim)", service, re.MULTILINE)
+    assert "EnvironmentFile=-/etc/diffuscope/head.env\n" in service
+    with pytest.raises(SettingError, match="no head is named"):
+        head_file("")
+    for words, message in (((), "imx296"), (("no_such_head",), "there is no head 'no_such_head'")):
+        done = subprocess.run([ROOT / "systemd/install", *words], cwd=tmp_path, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert message in done.stderr
 
 
 def test_the_watchdog_interval_covers_heartbeats_and_the_budget() -> None:

@@ -26,6 +26,7 @@ def _named(word: str | Path, kind: str, folders: list[Path]) -> Path:
     if str(word) not in shipped:
         near = difflib.get_close_matches(str(word), shipped, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
+        reason = f"there is no {kind} '{word}'{hint}" if place.parts else f"no {kind} is named"
         remedy = f"Give the path of a {kind} file, or one of: {', '.join(shipped)}."
-        raise SettingError(f"there is no {kind} '{word}'{hint}", remedy)
+        raise SettingError(reason, remedy)
     return shipped[str(word)]

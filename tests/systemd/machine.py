@@ -224,9 +224,5 @@ def leader(nspawn: subprocess.Popen[bytes], log: Path) -> int:
 
 def _install(machine: Machine) -> None:
     """Install as the README describes."""
-    units = "/opt/diffuscope/systemd"
-    machine.run("sh", "-c", f"cp {units}/*.service {units}/*.socket /etc/systemd/system/")
     machine.run("sh", "-c", "echo /opt/python/lib > /etc/ld.so.conf.d/python.conf && ldconfig")  # Python of the tests
-    machine.run("systemd-sysusers", f"{units}/diffuscope.sysusers")
-    machine.run("systemctl", "daemon-reload")
-    machine.run("systemctl", "enable", "diffuscope.service")
+    machine.run("bash", "/opt/diffuscope/systemd/install", "sim")
