@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers readme results parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers channel readme results effects parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -290,6 +290,12 @@ bench-wifi: .venv/ready browser ## Print how the page fares at the end of a bad 
 
 readme: .venv/ready ## Run every command of README's table in a fresh folder: exit codes, seconds, promised words.
 	@$(BIN)/python -m tests.bench.readme $(ONLY)
+
+channel: .venv/ready ## Serve an update channel with a signed test bundle, and the page that finds it; slots are emulated.
+	@$(BIN)/python -m tests.bench.channel $(PORT)
+
+effects: .venv/ready ## Simulate two scenes with the effects that each calls for and with all: time, difference, picture.
+	@$(BIN)/python -m tests.bench.effects out/effects.png
 
 results: .venv/ready ## Run the paper's experiments and write tests/paper/results.md with its pictures; ten minutes.
 	@$(BIN)/diffuscope paper -o out/paper --page tests/paper/results.md
