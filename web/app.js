@@ -5,6 +5,7 @@ import { actions } from "./core/actions.js";
 import { showAim } from "./core/aiming.js";
 import { EventStream, getCapture, getProtocol, releaseControl } from "./core/api.js";
 import { page } from "./screens/page_layout.js";
+import { goOnWhenShown, stay } from "./core/going_on.js";
 import { bindKeys } from "./core/keyboard.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
@@ -48,6 +49,7 @@ async function showRoute(route) {
 // Lazily loaded modules, and the screens that need them. A failed import is retried when the event stream is connected
 // again.
 const LAZY_MODULES = {
+  outcome: () => import("./screens/outcome.js"),
   history: () => import("./screens/history.js"),
   pictures: () => import("./screens/pictures.js"),
   send: () => import("./screens/send.js"),
@@ -57,9 +59,10 @@ const LAZY_MODULES = {
 };
 const MODULES_OF_SCREEN = {
   find: ["viewer"],
-  patient: ["viewer", "speech"],
-  aim: ["viewer", "speech"],
-  picture: ["viewer", "details"],
+  patient: ["viewer", "speech", "outcome"],
+  aim: ["viewer", "speech", "outcome"],
+  picture: ["viewer", "details", "outcome"],
+  outcome: ["outcome"],
   history: ["viewer", "history", "pictures"],
   send: ["send"],
   pictures: ["viewer", "pictures"],
@@ -112,7 +115,8 @@ function leaveVisit() {
 }
 
 // Initial keyboard focus of each screen.
-const FOCUS = { aim: "#shutter", picture: "#shutter", home: "#new", outcome: "#done" };
+const SHUTTER = "#shutter";
+const FOCUS = { aim: SHUTTER, picture: SHUTTER, home: "#new", outcome: "#done" };
 const focusScreen = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScroll: true });
 
 // ---- server events
@@ -180,6 +184,11 @@ function renderPage(state) {
 await loadLanguage(get().language);
 store.subscribe(renderPage);
 store.subscribe(finishWhenComplete);
+store.subscribe(goOnWhenShown);
+// A touch keeps the page where it is, but of the shutter, which impatient people press twice.
+for (const kind of ["pointerdown", "keydown", "wheel"]) {
+  addEventListener(kind, ({ target }) => /** @type {Element} */ (target).closest(SHUTTER) ?? stay(), { capture: true, passive: true });
+}
 bindKeys(actions);
 startRouter(showRoute);
 renderPage(get());

@@ -37,7 +37,7 @@
   while (walker.nextNode()) {
     const el = walker.currentNode.parentElement;
     if (!walker.currentNode.data.trim() || !el || !shown(el)) continue;
-    if (el.closest("script, noscript, dialog:not([open])")) continue;
+    if (el.closest("script, noscript, .unseen, dialog:not([open])")) continue;
     const control = el.closest("button, .button, .card, .prompt, .notices li, .state-bar");
     const glyphs = document.createRange();
     glyphs.selectNodeContents(walker.currentNode);

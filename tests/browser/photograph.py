@@ -16,7 +16,7 @@ from tests.browser.alert_causes import CAUSES, StandingAlerts, alert
 from tests.browser.conftest import CHROMIUM
 from tests.browser.looks import SIZES
 from tests.browser.real import POOR, Instruments, Real
-from tests.browser.walk import tap
+from tests.browser.walk import stay, tap
 
 LANGUAGES = ["en", "en-XA", "ta", "hi", "te"]
 
@@ -111,6 +111,7 @@ def shots(camera: Camera, real: Real) -> None:
         page.wait_for_selector("eye-live[data-frame]")
         real.show(cause)
         camera.tap("#shutter")
+        stay(page)
         if real.hold:
             camera.take("making", "[data-phase=making]")
             real.hold = "quick"
@@ -129,6 +130,9 @@ def shots(camera: Camera, real: Real) -> None:
         camera.tap("#again")
     real.show(None)
     camera.tap("#shutter")
+    camera.take("good-goes-on", "[data-phase=kept] [data-verdict=good] #result-title")
+    camera.take("aim-went-on", "[data-code='shot.next']")
+    camera.tap("[data-do=showAgain]")
     camera.take("good", "[data-phase=kept] [data-verdict=good] #result-title")
     camera.tap("#open-details")
     camera.take("details", "#details[open]")
@@ -142,6 +146,7 @@ def after(camera: Camera, real: Real, visit: str, at: Callable[[str, str, str], 
         camera.tap("#next")
         real.hold = hold
         camera.tap("#shutter")
+        stay(page)
         page.wait_for_selector("[data-phase=assessed]" if hold else "[data-phase=kept] .stage[data-mark=final]")
     camera.tap("#finish")
     camera.take("finish-question", "#finish-without")

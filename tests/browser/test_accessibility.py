@@ -8,7 +8,18 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.looks import look_for_faults
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, after_debounce, aiming, take_picture, tap, visit_of, wait_for_preview
+from tests.browser.walk import (
+    SHUTTER,
+    Open,
+    after_debounce,
+    agree,
+    aiming,
+    stay,
+    take_picture,
+    tap,
+    visit_of,
+    wait_for_preview,
+)
 
 pytestmark = pytest.mark.browser
 
@@ -40,7 +51,6 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
     expect(page.locator("dialog[open] #sentence")).to_be_visible()
     page.keyboard.press("Escape")
     strike(page, "[data-value=agreed]", "Space")
-    strike(page, "#shoot")
     wait_for_preview(page)
     reach(page, SHUTTER)
     with real.poor_light("saturated"):
@@ -49,6 +59,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
     after_debounce(page).keyboard.press("r")
     wait_for_preview(page)
     after_debounce(page).keyboard.press("Enter")
+    stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     after_debounce(page).keyboard.press("n")
     expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
@@ -61,6 +72,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
     strike(page, "[data-reason=still]")
     expect(page.locator(SHUTTER)).to_contain_text("Left eye · Centre")
     strike(page, SHUTTER)
+    stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     strike(page, "#finish")
     strike(page, "#finish-without")
@@ -79,6 +91,7 @@ def test_disabled_letter_keys_leave_shutter_keys_active(open_page: Open, real: R
     page.keyboard.press("Escape")
     reach(page, SHUTTER)
     after_debounce(page).keyboard.press("Space")
+    stay(page)
     page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
     for key in "rng?1":
         after_debounce(page).keyboard.press(key)
@@ -96,9 +109,7 @@ def test_magnified_page_scrolls_in_one_direction(open_page: Open, real: Real, si
     tap(page, "#new")
     page.wait_for_selector("#say")
     faults["patient"] = look_for_faults(page)
-    tap(page, "[data-value=agreed]")
-    tap(page, "#shoot")
-    wait_for_preview(page)
+    agree(page)
     page.wait_for_selector("#say")
     faults["aim"] = look_for_faults(page)
     take_picture(page)

@@ -24,7 +24,7 @@ SPECIFIED = set(
         r"\S+",
         """
         camera.missing camera.stalled light.fault light.limit light.day cal.missing cal.mismatch cal.old
-        light.cut shot.lost shot.crossed
+        light.cut shot.lost shot.crossed shot.next
         shot.saturated shot.dark shot.pupil shot.moved shot.blink shot.noeye shot.edge shot.halo shot.poor
         make.slow make.failed store.low store.full batt.low batt.empty heat.warm heat.hot power.lost link.lost
         link.slow link.other clock.wrong send.waiting send.stuck eye.side consent.missing consent.declined

@@ -16,6 +16,7 @@ from tests.browser.walk import (
     aiming,
     finish_early,
     new_person,
+    stay,
     take_picture,
     tap,
     visit_of,
@@ -61,6 +62,7 @@ def test_fast_tapping_keeps_every_picture(open_page: Open, real: Real) -> None:
         for slot in SLOTS:
             expect(page.locator(f"[data-slot='{slot}']")).to_have_attribute("aria-current", "step")
             tap(page, f"{SHUTTER}[aria-disabled=false]")
+            stay(page)
             wait_for_verdict(page)
             expect(page.locator("#result-title")).to_have_text("Good")
             expect(page.locator(".prompt")).not_to_contain_text("Hold still")
@@ -301,6 +303,7 @@ def test_fast_tapping_on_real_server(open_page: Open, server: Server, complaints
         page.wait_for_selector("[data-phase=assessed], [data-phase=kept], .state-bar", timeout=60_000)
         if page.locator(".state-bar, [data-screen=aim]").count():
             continue
+        stay(page)
         if page.locator("[data-slot][data-face=empty]").count() == 0:
             break
         tap(page, "#next")

@@ -7,7 +7,16 @@ from playwright.sync_api import expect
 
 from tests.browser.conftest import Complaints
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, after_debounce, new_person, take_picture, tap, visit_of, wait_for_preview
+from tests.browser.walk import (
+    SHUTTER,
+    Open,
+    after_debounce,
+    agree,
+    new_person,
+    take_picture,
+    tap,
+    visit_of,
+)
 from tests.journey.faults import wait_until_idle
 
 pytestmark = pytest.mark.browser
@@ -46,9 +55,7 @@ def test_consent_withdrawn_by_another_client_stops_light(
     assert len(real.rig.store.captures(500)) == kept
     if value is None:
         tap(page, "[data-do=ask]")
-        tap(page, "[data-value=agreed]")
-        tap(page, "#shoot")
-        wait_for_preview(page)
+        agree(page)
         take_picture(page)
     else:
         tap(page, ".state-bar [data-do=finish]")

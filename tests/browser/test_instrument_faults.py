@@ -9,7 +9,7 @@ from playwright.sync_api import Page, expect
 from device.values import BatteryState
 from tests.browser.conftest import Complaints
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, after_debounce, take_picture, tap, visit_of, wait_for_preview
+from tests.browser.walk import SHUTTER, Open, after_debounce, agree, take_picture, tap, visit_of, wait_for_preview
 from tests.journey.asking import MAX_BYTES
 from tests.journey.faults import wait_until_idle
 
@@ -22,9 +22,7 @@ def aiming(open_page: Open, real: Real, slot: str = "R-centre") -> Page:
     """Open a page that aims at the first slot of a new patient with consent."""
     page = open_page(real.url)
     tap(page, "#new")
-    tap(page, "[data-value=agreed]")
-    tap(page, "#shoot")
-    wait_for_preview(page)
+    agree(page)
     expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false", timeout=SOON_MS)
     return page
 

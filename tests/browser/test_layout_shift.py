@@ -6,7 +6,7 @@ from playwright.sync_api import Page, Route, expect
 from tests.browser.alert_causes import CAUSES
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, aiming, set_language, take_picture, tap, visit_of
+from tests.browser.walk import SHUTTER, Open, aiming, set_language, stay, take_picture, tap, visit_of
 
 pytestmark = pytest.mark.browser
 
@@ -27,6 +27,7 @@ def test_no_layout_shift_during_capture(open_page: Open, real: Real, size: tuple
     set_language(page, language)
     page.reload()
     tap(page, SHUTTER)
+    stay(page)
     page.wait_for_selector("[data-phase=assessed] .stage[data-mark=quick]")
     moving = (".stage", ".card", ".tools", ".tiles", ".actions")
     before = boxes(page, *moving)
@@ -164,7 +165,7 @@ def test_no_layout_shift_from_form_input(open_page: Open, real: Real) -> None:
     before = boxes(page, *chips, ".question .pad", "[data-field=diabetes]")
     unanswered: list[Route] = []
     page.route(f"**/api/visits/{visit['id']}", lambda route: unanswered.append(route))  # the answers stay unsaved
-    for selector in ("[data-value=agreed]", "[data-value=woman]", "[data-value=flashes]", "[data-key='5']"):
+    for selector in ("[data-value=declined]", "[data-value=woman]", "[data-value=flashes]", "[data-key='5']"):
         page.locator(selector).tap()
     expect(page.locator(".question output")).to_have_text("5")
     expect(page.locator("#unsaved")).not_to_be_empty()

@@ -19,6 +19,7 @@ from tests.browser.walk import (
     double_tap,
     finish_early,
     new_person,
+    stay,
     tap,
     wait_for_preview,
     wait_for_release,
@@ -52,7 +53,7 @@ def press(page: Page, complaints: Complaints, how: Callable[[], None]) -> None:
     for _ in range(5):
         after_debounce(page)
         how()
-        page.wait_for_selector("[data-screen=picture]")
+        stay(page)
         page.wait_for_selector("[data-phase=kept], [data-screen=aim]", timeout=30_000)
         if page.locator("[data-phase=kept]").count():
             return

@@ -11,7 +11,7 @@ from playwright.sync_api import Page, expect
 from tests.browser.axe import axe_faults
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Real
-from tests.browser.walk import Open, after_debounce, aiming, take_picture, tap, wait_for_preview
+from tests.browser.walk import Open, after_debounce, agree, aiming, take_picture, tap, wait_for_preview
 
 pytestmark = pytest.mark.browser
 
@@ -90,9 +90,7 @@ def test_consent_question_is_spoken_in_patient_language(voices_page: Page, real:
 
 
 def test_sentences_are_spoken_while_aiming(voices_page: Page) -> None:
-    tap(voices_page, "[data-value=agreed]")
-    tap(voices_page, "#shoot")
-    wait_for_preview(voices_page)
+    agree(voices_page)
     voices_page.locator("#say").tap()
     voices_page.locator("[data-slot=R-nerve]").tap()
     wait_for_preview(voices_page)
@@ -114,9 +112,7 @@ def test_sentences_are_spoken_while_aiming(voices_page: Page) -> None:
 
 
 def test_remote_shutter_works_after_speech_button(voices_page: Page, real: Real) -> None:
-    tap(voices_page, "[data-value=agreed]")
-    tap(voices_page, "#shoot")
-    wait_for_preview(voices_page)
+    agree(voices_page)
     voices_page.locator("#say").tap()
     after_debounce(voices_page).keyboard.press("Enter")
     voices_page.wait_for_selector("[data-screen=picture]")

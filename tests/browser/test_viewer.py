@@ -23,6 +23,7 @@ from tests.browser.walk import (
     after_debounce,
     aiming,
     loupe_position,
+    stay,
     take_picture,
     tap,
     visit_of,
@@ -221,8 +222,7 @@ def test_lost_context_falls_back_without_visible_change(open_page: Open, real: R
     red, green, blue = pixel(pic)
     assert red == green == blue > 40
     tap(page, "#again")
-    tap(page, SHUTTER)
-    page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+    take_picture(page)
     page.get_by_role("button", name="Red-free").tap()
     wait_until_drawn(page, "red-free 0 0")
     assert pixel(pic)[0] > 40
@@ -533,6 +533,7 @@ def test_picture_that_fails_to_load_once_is_fetched_again(open_page: Open, real:
     page.route("**/api/captures/*/*.png", fail_once)  # the final picture
     page.route("**/api/captures/*/quick.jpg", fail_once)  # the quick look and the thumbnail
     tap(page, SHUTTER)
+    stay(page)
     page.wait_for_selector("[data-phase=kept]")
     expect(page.locator("#picture .age")).to_have_text("The picture did not load. Trying again…")
     page.wait_for_selector(".stage[data-mark=final]")

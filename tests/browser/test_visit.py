@@ -16,11 +16,15 @@ from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Real
 from tests.browser.walk import (
     SHUTTER,
+    UNSEEN_MS,
     Open,
     after_debounce,
+    agree,
     aiming,
+    expect_to_stay,
     finish_early,
     new_person,
+    stay,
     take_picture,
     tap,
     visit_of,
@@ -68,6 +72,7 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
     real.hold = "expose"
     place = page.locator(".stage").bounding_box()
     tap(page, SHUTTER)
+    stay(page)
     page.wait_for_selector("[data-phase=making]")
     faults["making"] = look_for_faults(page, SHUTTER)
     real.hold = "quick"
@@ -124,11 +129,12 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
     assert faults == {name: [] for name in faults}
 
 
-def test_new_patient_needs_three_taps_and_no_typing(open_page: Open, real: Real) -> None:
+def test_new_patient_needs_two_taps_and_no_typing(open_page: Open, real: Real) -> None:
     page = open_page(real.url)
-    for selector in ("#new", "[data-value=agreed]", "#shoot"):
+    for selector in ("#new", "[data-value=agreed]"):
         tap(page, selector)
     wait_for_preview(page)
+    page.wait_for_timeout(UNSEEN_MS)
     tap(page, "#who")
     for field, value in (("sex", "woman"), ("diabetes", "yes"), ("diabetes_years", ">10"), ("vision_os", "CF")):
         page.locator(f"[data-field={field}] [data-value='{value}']").tap()
@@ -220,6 +226,9 @@ def test_unsaved_fields_are_resent_after_reconnection(open_page: Open, real: Rea
     expect(page.locator("[data-value=man]")).to_have_attribute("aria-pressed", "true")
     page.unroute(f"**/api/visits/{visit}")
     page.locator("[data-value=agreed]").tap()
+    wait_for_preview(page)
+    page.wait_for_timeout(UNSEEN_MS)
+    tap(page, "#who")
     expect(page.locator("#unsaved")).to_be_empty()
     assert real.visit()["fields"] == {"sex": "man", "consent": "agreed"}
 
@@ -234,6 +243,7 @@ def test_next_press_is_allowed_after_verdict(open_page: Open, real: Real) -> Non
     tap(page, "#next")
     expect_face(page, "R-centre", "making")
     tap(page, SHUTTER)
+    stay(page)
     page.wait_for_selector("[data-phase=assessed]")
     assert real.presses == 2
     real.hold = None
@@ -260,7 +270,8 @@ def test_laterality_question_moves_picture(open_page: Open, make_real: MakeReal)
     real = make_real(binning=4)
     real.rig.world.faults.add("eye.other")
     page = aiming(open_page, real)
-    take_picture(page)
+    tap(page, SHUTTER)
+    expect_to_stay(page)
     real.publish_alerts()
     expect(page.locator(".ask")).to_contain_text("This looks like the left eye. Change it?")
     page.locator("[data-do=change]").tap()
@@ -329,9 +340,7 @@ def test_reload_restores_every_screen(open_page: Open, real: Real) -> None:
     tap(page, "#new")
     page.wait_for_selector(".patient")
     reloaded("patient", "[data-value=agreed]")
-    tap(page, "[data-value=agreed]")
-    tap(page, "#shoot")
-    wait_for_preview(page)
+    agree(page)
     reloaded("aim", "eye-live[data-frame]")
     take_picture(page)
     reloaded("picture", ".stage[data-mark=final]")
@@ -451,6 +460,7 @@ def test_visit_by_shortcut_keys(open_page: Open, real: Real) -> None:
     after_debounce(page).keyboard.press("r")
     page.wait_for_selector("[data-screen=aim]")
     after_debounce(page).keyboard.press("Enter")
+    stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     after_debounce(page).keyboard.press("n")
     expect(page.locator(SHUTTER)).to_contain_text("Nerve")

@@ -12,6 +12,8 @@ from tests.journey.conftest import until
 
 SHUTTER = "#shutter"
 DEBOUNCE_MS = 450  # debounce time of the page (400 ms) and a margin
+UNSEEN_MS = 650  # for 600 ms a screen that changed by itself takes no press
+SHOWN_MS = 2500  # for 1.5 s a good picture is shown before the page goes on
 Open = Callable[..., Page]
 
 
@@ -56,19 +58,36 @@ def visit_of(page: Page) -> str:
 
 
 def new_person(page: Page) -> None:
-    """Go from Home to a live picture in three taps."""
+    """Go from Home to a live picture in two taps."""
     tap(page, "#new")
+    agree(page)
+
+
+def agree(page: Page) -> None:
+    """Answer the question for consent, and wait until the page aims and takes presses."""
     tap(page, "[data-value=agreed]")
-    tap(page, "#shoot")
     wait_for_preview(page)
+    page.wait_for_timeout(UNSEEN_MS)
+
+
+def stay(page: Page) -> None:
+    """Touch the picture screen, so that it does not go on by itself."""
+    page.locator("[data-screen=picture] .prompt").dispatch_event("pointerdown")
 
 
 def take_picture(page: Page) -> None:
-    """Press the shutter and wait for the final picture."""
+    """Press the shutter, stay, and wait for the final picture."""
     page.wait_for_selector("[data-screen=aim]")
     tap(page, SHUTTER)
-    page.wait_for_selector("[data-screen=picture]")
+    stay(page)
     page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+
+
+def expect_to_stay(page: Page) -> None:
+    """Check that the page does not go on by itself from the final picture."""
+    page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+    page.wait_for_timeout(SHOWN_MS)
+    expect(page.locator("[data-screen=picture] #again")).to_be_visible()
 
 
 def finish_early(page: Page) -> None:

@@ -2,6 +2,7 @@
 
 import { icon } from "./icons.js";
 import { colourLink, finalPicture } from "../core/api.js";
+import { alertText } from "../core/alerts.js";
 import { allowsLight, consentOf, eyeOf, currentCapture } from "../core/state.js";
 import { chips, slotLabel, standing, topAlert, alertBar, versionName, whyGreen } from "./components.js";
 import { html } from "../vendor/lit-html.js";
@@ -56,10 +57,19 @@ export function pictureArea(state, actions) {
           @zoomed=${actions.zoomed}
           @loupe=${actions.loupeChanged}
         ></eye-pic>
-      </div>
+      </div> <p class="unseen" aria-live="polite">${announcement(state)}</p>
       ${isExamScreen(state) ? [prompt(state, actions), isAiming(state) ? "" : standing(state, actions), chips(state, actions)] : ""}
     </section>
   `;
+}
+
+/**
+ * What a screen reader says after the page went on by itself.
+ * @param {State} state
+ */
+function announcement(state) {
+  const left = state.alerts.find(({ code }) => code === "shot.next");
+  return left ? `${alertText(left)} ${t("result.next.field", slotLabel(state, state.route.slot))}` : "";
 }
 
 function sourceOf(capture, { redfree, version, visit }) {

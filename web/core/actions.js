@@ -9,6 +9,7 @@ import { qrCode } from "./qr_code.js";
 import { navigate } from "./router.js";
 import { dismissAlert, lowerAlert, lowerAlerts, raiseAlert } from "./alerts.js";
 import { previewActions } from "./aiming.js";
+import { aimByItself } from "./going_on.js";
 import { refreshStatus, setControl } from "./status.js";
 import * as visits from "./visit.js";
 import { loadLanguage, t, today } from "../i18n/translate.js";
@@ -20,6 +21,7 @@ const THUMB_RETRY_MS = 1000;
 const THUMB_RETRY_MAX_MS = 64_000;
 const TOOL_STEPS = 5; // largest step of brightness and contrast, in either direction
 
+const firstSlot = () => get().visit?.next_slot ?? get().protocol?.slots[0].id;
 const goToAim = (slot) => navigate({ screen: "aim", visit: currentRoute().visit, slot });
 
 const navigationActions = {
@@ -27,11 +29,13 @@ const navigationActions = {
   begin: (number) => visits.begin(number),
   resume: visits.resume,
   retryUploads: visits.retryUploads,
-  startAiming() {
-    const { visit } = get();
-    if (visit) navigate({ screen: "aim", visit: visit.id, slot: visit.next_slot ?? get().protocol?.slots[0].id });
-  },
+  startAiming: () => goToAim(firstSlot()),
   setField: visits.setField,
+  /** Record the answer to the question for consent; after "agreed" aim at once. */
+  answerConsent(value) {
+    visits.setField("consent", value);
+    if (value === "agreed" && !get().auto) aimByItself(currentRoute().visit, firstSlot());
+  },
   typeNumber(key) {
     const typed = applyKey(get().typed, key, 12);
     set({ typed });
@@ -203,6 +207,7 @@ const alertButtons = {
     visits.confirmEye(slot ?? currentRoute().slot, id ?? currentCapture(get())?.id);
   },
   uncross: visits.undoNotPossible,
+  showAgain: ({ slot }) => navigate({ screen: "picture", visit: currentRoute().visit, slot }),
 };
 
 const settingsActions = {

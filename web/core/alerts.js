@@ -32,6 +32,7 @@ const TABLE = [
   ["light.cut", "refused", []],
   ["shot.lost", "tell", ["takeNow"]],
   ["shot.crossed", "tell", ["uncross"], { wait_s: 10 }],
+  ["shot.next", "tell", ["showAgain"]],
   ["camera.stalled", "tell", []],
   ["power.lost", "tell", ["takeNow"]],
   ["link.slow", "tell", []],

@@ -5,7 +5,7 @@
 import { newIdempotencyKey, getCapture, ApiError, send } from "./api.js";
 import { allowsLight, eyeOf, PICTURE_DEFAULTS, get, set, currentCapture } from "./state.js";
 import { navigate } from "./router.js";
-import { buttonsChanged } from "./taps.js";
+import { buttonsChanged, isUnseen } from "./taps.js";
 import { lowerAlerts, raiseAlert, raiseRefusal, visibleAlerts } from "./alerts.js";
 import { alertOnError, refreshVisit } from "./visit.js";
 import { t } from "../i18n/translate.js";
@@ -33,7 +33,7 @@ const captureById = (id) => get().captures.find((capture) => capture.id === id);
 export function takePicture() {
   const { route } = get();
   if (route.screen === "picture") showPendingNote();
-  if (route.screen !== "aim" || !allowsLight(get())) return;
+  if (route.screen !== "aim" || !allowsLight(get()) || isUnseen()) return;
   // No request while a blocking alert is visible: over a dead connection it could arrive later and switch on unexpected
   // light. The server refuses presses for all other reasons.
   if (visibleAlerts(get()).stop) return;
@@ -52,6 +52,7 @@ async function submitCapture(visit, slot) {
   for (const { id, over } of get().captures) if (id && over) finishedIds.add(id);
   lowerAlerts(({ from }) => from === "press");
   setCaptures([...get().captures, Object.freeze({ key, visit, slot, eye, id: null, stage: FIRST_STAGE, verdict: null, over: false })]);
+  set({ goesOnFrom: get().auto ? null : key });
   navigate({ screen: "picture", visit, slot });
   playCue("taken");
   try {

@@ -70,7 +70,7 @@ const settings = Object.freeze({
  *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: string, zoom: number, note: string,
  *   picked: readonly string[], compared: readonly CaptureRecord[], montages: Readonly<Record<string, any>>,
  *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, uploadQueue: any,
- *   finishing: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
+ *   finishing: string | null, goesOnFrom: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
  *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
  *   blink: boolean, front: number, qrCode: {size: number, path: string} | null, noticeCount: number,
  *   shownFindings: readonly string[], interruptedShown: boolean, promptedMs: number, readySinceMs: number}} State
@@ -102,6 +102,7 @@ export const store = createStore(/** @type {State} */ ({
   copied: null,
   uploadQueue: null, // upload queue, for the Send screen
   finishing: null, // visit to finish after its last capture
+  goesOnFrom: null, // key of the newest capture, while the page goes on from it by itself
   now: 0, // updated every second during a countdown
   modules: Object.freeze({}), // lazily loaded modules, by name
   speech: null, // sentences for the patient: {tag, words, hasVoice}, see speech.js

@@ -7,7 +7,6 @@ import { currentCapture } from "../core/state.js";
 import { chips, patientLabel, standing } from "../components/components.js";
 import { aim } from "./aim.js";
 import { find, home } from "./home.js";
-import { outcome } from "./outcome.js";
 import { patient } from "./patient.js";
 import { picture } from "./picture.js";
 import { isExamScreen, pictureArea } from "../components/picture_area.js";
@@ -18,7 +17,7 @@ import { has, t } from "../i18n/translate.js";
 
 const SPACE_PLENTY = 200; // patients; weeks of screening
 
-const SCREENS = { home, find, patient, aim, picture, outcome };
+const SCREENS = { home, find, patient, aim, picture };
 
 /**
  * Template of the whole exam page.
@@ -26,7 +25,7 @@ const SCREENS = { home, find, patient, aim, picture, outcome };
  */
 export function page(state, actions) {
   const { modules, route } = state;
-  const loaded = [modules.history, modules.pictures, modules.send].find((module) => module?.[route.screen]);
+  const loaded = [modules.outcome, modules.history, modules.pictures, modules.send].find((module) => module?.[route.screen]);
   const screen = (SCREENS[route.screen] ?? loaded?.[route.screen])?.(state, actions) ?? nothing;
   const exam = isExamScreen(state);
   return html`

@@ -46,7 +46,7 @@ export function patient(state, actions) {
         field: "consent",
         value: fields.consent,
         options: options("consent", ["agreed", "declined"]),
-        choose: (value) => actions.setField("consent", value),
+        choose: actions.answerConsent,
       })}
       ${startButton(visit, state, actions)}
       <p class="muted" id="unsaved">${waiting.length ? t("save.waiting") : ""}</p>

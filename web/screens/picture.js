@@ -3,6 +3,7 @@
 
 import { icon } from "../components/icons.js";
 import { colourLink } from "../core/api.js";
+import { followingSlot } from "../core/going_on.js";
 import { currentCapture } from "../core/state.js";
 import { choice, question, slotLabel, tiles, versionName } from "../components/components.js";
 import { ALERTS, timeLeft, alertText } from "../core/alerts.js";
@@ -77,7 +78,8 @@ function detailsButton(actions, { report }) {
 function verdictText(state, capture) {
   if (capture.failed) return ["warn", t("verdict.again"), alertText(capture.failed)];
   if (capture.verdict?.word === "good") {
-    return ["star", t("verdict.good"), [t("verdict.good.what"), capture.over ? "" : t("make.goon")].join(" ")];
+    const what = t(followingSlot(state) ? "verdict.good.next" : "verdict.good.what");
+    return ["star", t("verdict.good"), [what, capture.over ? "" : t("make.goon")].join(" ")];
   }
   if (!capture.verdict) return ["check", t("verdict.none"), ""];
   if (exhausted(state, capture)) return ["pen", t("verdict.again"), alertText({ code: "shot.poor", n: triesOf(state, capture) })];
