@@ -63,22 +63,6 @@ def trace(surfaces: Sequence[Surface], beam: Rays, index_before: float = 1.0) ->
     return beam
 
 
-def paths(surfaces: Sequence[Surface], beam: Rays, index_before: float = 1.0) -> Points:
-    """Return the points of rays at their start and on each surface, (surfaces + 1, rays, 3), mm, for drawings.
-
-    SpecError as for `trace`, and for a ray that an aperture blocks.
-    """
-    points = [beam.points_mm]
-    for surface in surfaces:
-        after = trace([surface], beam, index_before)
-        if len(after.numbers) < len(beam.numbers):
-            raise SpecError(f"a ray is blocked at {surface.name}", "Draw surfaces without clear apertures.")
-        beam = after
-        index_before = surface.index_behind
-        points.append(beam.points_mm)
-    return np.array(points)
-
-
 def at_plane(beam: Rays, at_mm: float) -> Points:
     """Return the points of rays in the plane z = `at_mm`, (rays, 3)."""
     steps = (at_mm - beam.points_mm[:, 2]) / beam.directions[:, 2]
@@ -130,17 +114,6 @@ def _refract(surface: Surface, beam: Rays, normals: Points, index_before: float)
         number = int(beam.numbers[np.flatnonzero(under < 0)[0]])
         raise SpecError(f"ray {number} is totally reflected at {surface.name}", _NARROWER)
     return np.asarray(ratio * beam.directions + (np.sqrt(under) - ratio * into)[:, None] * normals)
-
-
-def reversed_surfaces(surfaces: Sequence[Surface], index_before: float = 1.0) -> tuple[Surface, ...]:
-    """Return the same surfaces as light from behind meets them: mirrored at z = 0, in the opposite order."""
-    before = [index_before, *(surface.index_behind for surface in surfaces[:-1])]
-    return tuple(
-        replace(
-            surface, at_mm=-surface.at_mm, radius_mm=-surface.radius_mm, index_behind=index, tilt_deg=-surface.tilt_deg
-        )
-        for surface, index in zip(reversed(surfaces), reversed(before), strict=True)
-    )
 
 
 def moved(surfaces: Sequence[Surface], by_mm: float) -> tuple[Surface, ...]:

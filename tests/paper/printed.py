@@ -8,7 +8,6 @@ import numpy as np
 from scipy import ndimage
 
 from device.optics.light_path import load_light_path
-from device.optics.traced_relay import TracedRelay, field_of_cone_deg, traced_relay
 from device.recon.assessment.metrics import Scores, shift_px
 from device.values import Image
 from services import resources
@@ -16,6 +15,7 @@ from tests.paper.bench import DEFAULT, Bench, HeadChanges, SimulatedFrame
 from tests.paper.edges import edge_signs, spots_followed
 from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, attempted, below, within
 from tests.paper.pictures import compared, cutline, raw_cutlines
+from tests.paper.relay_figures import BuiltRelay, built_relay, field_of_cone_deg
 from tests.paper.screen import DOT_MU, apply_floor, find_dots
 from tests.paper.traced import PAPER_CONE_DEG, PAPER_RING_MM
 
@@ -296,7 +296,7 @@ def lattice_deg(take: SimulatedFrame, picture: Image) -> tuple[float, float]:
     return float(np.ptp(right_deg)), halves[1] - halves[0]
 
 
-def field_to_rims_deg(relay: TracedRelay, led_mm: float) -> float:
+def field_to_rims_deg(relay: BuiltRelay, led_mm: float) -> float:
     """Return the field that the widest cone of an LED lights whose rays pass the rims of all lenses, degrees."""
     low, high = 0.0, 60.0
     for _ in range(20):
@@ -309,7 +309,7 @@ def field_to_rims_deg(relay: TracedRelay, led_mm: float) -> float:
 def run_fields(bench: Bench) -> Outcome:
     """Measure the width of a print lit by two cones of the LEDs, and that of a lattice wider than the paper's."""
     bench.progress("S7: what limits the field")
-    relay, led_mm = traced_relay(load_light_path(resources.LIGHT_PATH)), PAPER_RING_MM / 2
+    relay, led_mm = built_relay(load_light_path(resources.LIGHT_PATH)), PAPER_RING_MM / 2
     fields = [field_of_cone_deg(relay, cone, led_mm) for cone in (PAPER_CONE_DEG, WIDER_CONE_DEG)]
     (lit, picture, lit_deg), (wide, wider, wide_deg) = (lit_print_deg(bench, field_deg) for field_deg in fields)
     shining = bench.expose("paper_dots", WIDE_LATTICE)

@@ -8,23 +8,24 @@ import numpy as np
 
 from device.optics.eye import Relay
 from device.optics.light_path import LightPath, load_light_path
-from device.optics.ray_trace import Surface, paths, rays
-from device.optics.traced_relay import (
-    Deviation,
-    TracedRelay,
-    built_relays,
-    displacement_error,
-    f_theta_error,
-    field_of_cone_deg,
-    retina_point,
-    traced_relay,
-    without_rims,
-)
+from device.optics.ray_trace import Surface, rays
+from device.optics.traced_relay import without_rims
 from services import resources
 from services.plot import document, line, polyline, text
 from tests.paper.bench import Bench
 from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, attempted, below, within
 from tests.paper.pictures import trend
+from tests.paper.relay_figures import (
+    BuiltRelay,
+    Deviation,
+    built_relay,
+    built_relays,
+    displacement_error,
+    f_theta_error,
+    field_of_cone_deg,
+    paths,
+    retina_point,
+)
 
 DRAWS, SEED = 60, 23
 DRAWN_DEG = {0.0: "s1", 15.0: "s0", 25.0: "s2", 30.0: "s3"}
@@ -70,7 +71,7 @@ def within_tolerances(path: LightPath) -> Built:
 
 def _far_eye_note(path: LightPath) -> str:
     """Return the note on an eye that stands OFF_MM too far from the lenses."""
-    far = traced_relay(path, None, Deviation(pupil_axial_mm=OFF_MM))
+    far = built_relay(path, Deviation(pupil_axial_mm=OFF_MM))
     return (
         f"An eye {OFF_MM:g} mm too far from the lenses lights {100 * far.lit_share(30):.1f} % of the iris at 30 "
         "degrees: the distance was chosen so that this is about the paper's 6.3 %. The iris is then filled up to "
@@ -84,7 +85,7 @@ def run_trace(bench: Bench) -> Outcome:
     """Trace the relay, the model eye and the illumination; compare with the paper's angles and its 6.3 %."""
     bench.progress("T: ray trace of the real lenses")
     path = load_light_path(resources.LIGHT_PATH)
-    relay = traced_relay(path)
+    relay = built_relay(path)
     built = within_tolerances(path)
     claims = (*_imaging(relay, built), *_eye(path), *_illumination(relay))
     shares = {float(angle): relay.lit_share(angle) for angle in range(20, 33)}
@@ -101,7 +102,7 @@ def run_trace(bench: Bench) -> Outcome:
     return Outcome(claims, shown, (_table(relay, path),), (*NOTES, _far_eye_note(path)))
 
 
-def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
+def _imaging(relay: BuiltRelay, built: Built) -> tuple[Claim, ...]:
     margin_mm = Relay().pupil_margin_mm(relay.pupil_mm)
     return (
         within("focal length of the first pair, mm", relay.first.focal_mm, 36.7, 38.3, "37.5", 2).limit_from(PAIR),
@@ -141,7 +142,7 @@ def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
     )
 
 
-def _displacements(relay: TracedRelay) -> tuple[Claim, ...]:
+def _displacements(relay: BuiltRelay) -> tuple[Claim, ...]:
     """Return the claims on the displacement on the sensor and on the angle behind the relay."""
     over_formula, over_ideal = displacement_error(relay, 25)
     linear, tangent = f_theta_error(relay, 25)
@@ -180,7 +181,7 @@ def _eye(path: LightPath) -> tuple[Claim, ...]:
     )
 
 
-def _illumination(relay: TracedRelay) -> tuple[Claim, ...]:
+def _illumination(relay: BuiltRelay) -> tuple[Claim, ...]:
     field_deg = field_of_cone_deg(relay, PAPER_CONE_DEG, PAPER_RING_MM / 2)
     ring_mm = 2 * abs(relay.lamp_ray(PAPER_RING_MM / 2, 0.0)[0])
     return (
@@ -193,7 +194,7 @@ def _illumination(relay: TracedRelay) -> tuple[Claim, ...]:
     )
 
 
-def _table(relay: TracedRelay, path: LightPath) -> Table:
+def _table(relay: BuiltRelay, path: LightPath) -> Table:
     rows = []
     for angle in (5, 10, 15, 20, 25, 28, 30):
         point, screen = retina_point(path, angle), retina_point(path, angle, inf)
@@ -224,7 +225,7 @@ def _table(relay: TracedRelay, path: LightPath) -> Table:
     return Table(head, tuple(rows))
 
 
-def _drawing(relay: TracedRelay, path: LightPath) -> Figure:
+def _drawing(relay: BuiltRelay, path: LightPath) -> Figure:
     """Return the scale drawing of the relay in the plane across the plate's tilt, with rays of four field angles."""
     surfaces = without_rims(relay.surfaces)
     iris = Surface(relay.iris_at_mm, inf, 1.0, name="the iris")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from device.optics.light_path import load_light_path
-from device.optics.traced_relay import traced_relay
 from services import resources
 from tests.paper.bench import Bench
 from tests.paper.edges import edge_signs
 from tests.paper.printed import WIDE_LATTICE, field_to_rims_deg, lattice_deg
+from tests.paper.relay_figures import built_relay
 from tests.paper.report import EXPERIMENTS
 from tests.paper.screen import FLOOR
 
@@ -41,7 +41,7 @@ def test_the_half_width_of_a_lattice_is_that_of_its_falloff() -> None:
 
 
 def test_the_rims_end_the_field_of_an_led_without_a_cap() -> None:
-    relay = traced_relay(load_light_path(resources.LIGHT_PATH))
+    relay = built_relay(load_light_path(resources.LIGHT_PATH))
     field_deg = field_to_rims_deg(relay, 4.75)
     half_cone_deg = field_deg / 2 * relay.first.focal_mm / relay.second.focal_mm
     assert np.isfinite(relay.lamp_ray(4.75, half_cone_deg - 1)[1])
