@@ -22,7 +22,6 @@ from device.user_files import files_in
 from services.backup.backup_key import HEADER_FILES, BackupHeader, encoded_model, read_model
 from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
-from services.records import blobs
 
 PREFIX = "diffuscope-backup-"
 _LINE = re.compile(r"([0-9a-f]{64}) ([0-9a-f]{64}) ([0-9]+)")
@@ -142,7 +141,7 @@ def read_backup_file(folder: Path, path: Path) -> bytes:
     UsbDriveUnavailable if that cannot be read either: the stick was pulled out.
     """
     try:
-        return blobs.read_blob(path)
+        return path.read_bytes()
     except OSError as error:
         if not any(_is_on_disk(folder / name) for name in HEADER_FILES):
             raise UsbDriveUnavailable(f"{folder} refused: {error.strerror or error}") from error

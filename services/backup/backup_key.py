@@ -23,7 +23,7 @@ from device import atomic_io
 from device.errors import SpecError
 from device.user_files import read_text
 from services.errors import BackupDamaged, BackupKeyWrong
-from services.records import blobs, digested_json
+from services.records import digested_json
 
 KEY_FILE = "backup.json"
 HEADER_FILES = (KEY_FILE, "backup-copy.json")  # in a folder of backups: without the header no passphrase helps
@@ -161,7 +161,7 @@ def encoded_model(model: BaseModel) -> bytes:
 def read_model(path: Path, model: type[Model]) -> Model:
     """Return the content of a JSON file as a model; BackupDamaged if it cannot be read, or if one bit has changed."""
     try:
-        return model.model_validate(digested_json.decoded(blobs.read_blob(path)))
+        return model.model_validate(digested_json.decoded(path.read_bytes()))
     except (OSError, ValueError) as error:
         raise BackupDamaged(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
 

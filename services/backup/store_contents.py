@@ -16,7 +16,7 @@ from pathlib import Path
 from device import atomic_io
 from device.user_files import files_in
 from services.errors import BackupDamaged, StoreDamaged
-from services.records import blobs, device_identity, reserve_file, schema, snapshots
+from services.records import device_identity, reserve_file, schema, snapshots
 from services.records.record_files import CAPTURE_RECORD
 
 # Logs of the database (their rows are in its copy), older copies of it, the present reserve, and measurements of the
@@ -45,7 +45,7 @@ def fingerprint(store: Path, unit: str) -> bytes:
     for path in _files_below(folder):
         digest.update(f"\0{path.relative_to(folder)}\0{path.stat().st_size}\0".encode())
         if not has_record or path.name == CAPTURE_RECORD:
-            digest.update(blobs.read_blob(path))
+            digest.update(path.read_bytes())
     return digest.digest()
 
 
@@ -78,7 +78,7 @@ def packed(files: Mapping[str, Path | bytes]) -> bytes:
     with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name, source in files.items():
             entry = tarfile.TarInfo(name)
-            content = source if isinstance(source, bytes) else blobs.read_blob(source)
+            content = source if isinstance(source, bytes) else source.read_bytes()
             entry.mode = atomic_io.PRIVATE_FILE
             entry.size = len(content)
             archive.addfile(entry, io.BytesIO(content))

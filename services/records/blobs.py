@@ -1,4 +1,4 @@
-"""Reading and writing of whole files of the store: frames, pictures, reports and records."""
+"""Content of a new file of the store, in memory or on the disk already, and folders written from such files."""
 
 import errno
 import os
@@ -22,26 +22,6 @@ _NO_LINKS = frozenset({errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}) 
 FileContent = bytes | WrittenFile  # of a new file: its content, or a file of the same file system that has it
 
 
-def read_blob(path: Path) -> bytes:
-    """Return the content of a file; OSError if it cannot be read."""
-    return path.read_bytes()
-
-
-def write_blob(path: Path, content: bytes) -> None:
-    """Write or replace a file atomically and durably; OSError if the disk refuses."""
-    atomic_io.write_atomically(path, content)
-
-
-def write_blob_unsynced(path: Path, content: bytes) -> None:
-    """Write or replace a file atomically for other processes, but not durably: a power cut may leave it incomplete."""
-    atomic_io.write_atomically_unsynced(path, content)
-
-
-def write_new_blob(path: Path, content: bytes) -> None:
-    """Write a new file; its name is durable after `fsync_folder`. OSError if it exists or the disk refuses."""
-    atomic_io.write_file(path, content)
-
-
 def write_folder(folder: Path, contents: Mapping[str, FileContent]) -> None:
     """Write a new folder with these files (name -> content), durable on return but for the folder's own name.
 
@@ -62,4 +42,4 @@ def _link_or_copy(source: Path, target: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        write_new_blob(target, read_blob(source))
+        atomic_io.write_file(target, source.read_bytes())

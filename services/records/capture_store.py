@@ -250,7 +250,7 @@ class CaptureStore:
             raise RecordNotFound(f"{id} has no file named {name!r}")
         # The path is built from the row alone: path traversal through `id` or `name` is impossible.
         try:
-            content = blobs.read_blob(self._captures / row.id / name)
+            content: bytes = (self._captures / row.id / name).read_bytes()
         except OSError as error:
             if (removal := self.removed.removal(row.id)) is not None and is_large(name):
                 when = f"{removal.removed_at:%Y-%m-%d}"

@@ -19,7 +19,7 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from services.errors import RecordNotFound, VersionRefused
-from services.records import blobs, row_validation, schema
+from services.records import row_validation, schema
 from services.records.capture import CaptureReport, CaptureVersion
 from services.records.capture_rows import NAME
 from services.records.record_signing import recorded
@@ -84,7 +84,7 @@ class CaptureVersions:
         place = self._captures / row.id
         try:
             for name, content in files.items():
-                blobs.write_blob(place / name, content)
+                atomic_io.write_atomically(place / name, content)
         except OSError:
             for name in files:
                 (place / name).unlink(missing_ok=True)

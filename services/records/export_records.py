@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 
 from device import atomic_io
-from services.records import blobs, digested_json, row_validation
+from services.records import digested_json, row_validation
 from services.records.storage_errors import storage_errors
 
 
@@ -22,12 +22,12 @@ class ExportRecords:
         entries = {"finished_at": finished_at.isoformat(), "exported_at": exported_at.isoformat()}
         with storage_errors():
             atomic_io.make_folder(self._folder)
-            blobs.write_blob(self._folder / f"{visit}.json", digested_json.encoded(entries))
+            atomic_io.write_atomically(self._folder / f"{visit}.json", digested_json.encoded(entries))
 
     def exported_state(self, visit: str) -> datetime | None:
         """Return the `finished_at` of the exported state; None without one, or if the record cannot be read."""
         try:
-            entries = digested_json.decoded(blobs.read_blob(self._folder / f"{visit}.json"))
+            entries = digested_json.decoded((self._folder / f"{visit}.json").read_bytes())
             return row_validation.timestamp(entries["finished_at"])
         except (OSError, ValueError, KeyError):
             return None

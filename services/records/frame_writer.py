@@ -24,7 +24,7 @@ from device.values import Frame
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
 from services.records import digested_json
-from services.records.blobs import WrittenFile, read_blob, write_new_blob
+from services.records.blobs import WrittenFile
 from services.records.json_values import JsonObject
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class StoredFrame:
 
     def load(self) -> tuple[Frame, RawMetadata]:
         """Return the frame and its metadata; OSError or FrameError if the file cannot be read."""
-        counts, metadata = picture_files.read_raw_tiff(read_blob(self.file.path))
+        counts, metadata = picture_files.read_raw_tiff(self.file.path.read_bytes())
         if metadata.exposure_s is None or metadata.simulated is None:
             raise FrameError(f"{self.file.path.name} has no exposure time, or no mark of its origin")
         light = metadata.illumination
@@ -108,8 +108,8 @@ class FrameWriter:
             atomic_io.make_folder(self._folder)
             content = picture_files.raw_tiff(taken.frame.counts, taken.metadata)
             file = WrittenFile(path, hashlib.sha256(content).hexdigest(), len(content))
-            write_new_blob(path, content)
-            write_new_blob(note, digested_json.encoded(_note_of(file, taken)))
+            atomic_io.write_file(path, content)
+            atomic_io.write_file(note, digested_json.encoded(_note_of(file, taken)))
             atomic_io.fsync_folder(self._folder)
         except (OSError, DiffuscopeError) as error:
             self._has_failed = True
@@ -129,7 +129,7 @@ def stored_frames(folder: Path) -> tuple[StoredFrame, ...]:
     found = []
     for note in files_in(folder, "*.tiff.json"):
         try:
-            found.append(_checked(folder / note.stem, digested_json.decoded(read_blob(note))))
+            found.append(_checked(folder / note.stem, digested_json.decoded(note.read_bytes())))
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning("%s of the interrupted capture %s is left out: %s", note.stem, folder.name, error)
     return tuple(sorted(found, key=lambda frame: frame.number))
@@ -147,7 +147,7 @@ def _note_of(file: WrittenFile, taken: TakenFrame) -> JsonObject:
 
 def _checked(path: Path, note: JsonObject) -> StoredFrame:
     """Return the frame of a note; ValueError if its file is not the one that was written, OSError if it is gone."""
-    content = read_blob(path)
+    content = path.read_bytes()
     file = WrittenFile(path, hashlib.sha256(content).hexdigest(), len(content))
     if (file.sha256, file.length_bytes) != (note["file_sha256"], note["length_bytes"]):
         raise ValueError(f"{file.length_bytes} bytes that are not those of its note")

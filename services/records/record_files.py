@@ -8,7 +8,7 @@ from pathlib import Path
 from device import atomic_io
 from device.user_files import files_in
 from services.errors import StoreDamaged
-from services.records import blobs, row_validation
+from services.records import row_validation
 from services.records.record_document import Kind, RecordDocument, parse_document
 
 CAPTURE_RECORD = "record.json"
@@ -44,7 +44,7 @@ class RecordFiles:
         with row_validation.reading_record(id):
             path = self.path(kind, id)
             try:
-                content = blobs.read_blob(path)
+                content = path.read_bytes()
             except (FileNotFoundError, NotADirectoryError):
                 return None
             except OSError as error:
@@ -68,7 +68,7 @@ class RecordFiles:
         for document in documents:
             path = self.path(document.kind, document.id)
             if path.parent.is_dir():
-                blobs.write_blob(path, document.encoded())
+                atomic_io.write_atomically(path, document.encoded())
 
     def write_all(self, documents: Iterable[RecordDocument]) -> None:
         """Write or replace the files of many records, durable on return by one sync instead of two for each file.
@@ -80,7 +80,7 @@ class RecordFiles:
         for document in documents:
             path = self.path(document.kind, document.id)
             if path.parent.is_dir():
-                blobs.write_blob_unsynced(path, document.encoded())
+                atomic_io.write_atomically_unsynced(path, document.encoded())
                 written = True
         if written:
             os.sync()

@@ -19,7 +19,7 @@ from typing import Literal, get_args
 from device import atomic_io
 from device.user_files import files_in
 from services.errors import StoreDamaged
-from services.records import blobs, digested_json, row_validation
+from services.records import digested_json, row_validation
 from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ class RemovedCaptures:
         if not path.exists():
             return None
         try:
-            entries = digested_json.decoded(blobs.read_blob(path))
+            entries = digested_json.decoded(path.read_bytes())
             reason: Reason = row_validation.one_of(entries["reason"], *get_args(Reason))
             return Removal(reason, row_validation.timestamp(entries["removed_at"]))
         except (OSError, ValueError, KeyError) as error:
@@ -78,7 +78,7 @@ class RemovedCaptures:
                 if not present:
                     continue
                 mark = {"reason": removal.reason, "removed_at": removal.removed_at.isoformat()}
-                blobs.write_blob(self._captures / id / MARK, digested_json.encoded(mark))
+                atomic_io.write_atomically(self._captures / id / MARK, digested_json.encoded(mark))
                 aside = self._aside(id) or self._folder / f"{self._next_number():06}-{id}"
                 atomic_io.make_folder(aside)
                 for path in present:

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from device.user_files import files_in
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import blobs, record_signing, row_validation, schema
+from services.records import record_signing, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.record_document import Kind, RecordDocument
@@ -149,7 +149,7 @@ def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocumen
         files = document.content.get("files")
         for name, described in files.items() if kind == "capture" and isinstance(files, dict) else ():
             try:
-                content = blobs.read_blob(folder / "captures" / id / Path(name).name)
+                content = (folder / "captures" / id / Path(name).name).read_bytes()
             except OSError:
                 if not is_large(name) or not (folder / "captures" / id / MARK).exists():
                     result.damaged.append(f"{id}/{name}")
