@@ -20,16 +20,16 @@ def burst(
     clock: Clock,
     eyes: Sequence[Eye] = EYES,
     *,
+    whole_s: float,
     in_visit: bool = False,
     parts: int = 1,
-    whole_s: float | None = None,
     taken: Callable[[Frame], None] = lambda _: None,
 ) -> tuple[Frame, ...]:
     """Return up to `count` frames in one illumination, which stays on from the first to the last of them.
 
     There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
-    off. With `parts` above 1 each of the `count` exposures of `whole_s` seconds (None: of all its parts) is split into
-    so many frames, and `shot` is one of them: the lamp is then on no longer than for `count` whole exposures, with one
+    off. With `parts` above 1 each of the `count` exposures of `whole_s` seconds is split into so many
+    frames, and `shot` is one of them: the lamp is then on no longer than for `count` whole exposures, with one
     planned overhead for each of these; read-outs that take longer cost the last frames. The dose counts for `eyes`,
     whose limit is lower outside a visit. `taken` is called with each frame after its read-out, while the lamp is on: it
     must return at once. Raises LightCut if the guard has ended the first exposure; a frame that it ended later is left
@@ -53,15 +53,13 @@ def burst(
     return tuple(frames)
 
 
-def _whole_s(part_s: float, longest_s: float, parts: int, whole_s: float | None) -> float:
+def _whole_s(part_s: float, longest_s: float, parts: int, whole_s: float) -> float:
     """Return how long the lamp may be on for one split exposure: `whole_s` with the overhead of one frame, seconds.
 
     `longest_s`: duration of the first part, of `part_s` of exposure. A longer overhead than the one by which the parts
     were made shorter does not count: a stall adds no light.
     """
     overhead_s = longest_s - part_s
-    if whole_s is None:
-        return parts * part_s + overhead_s
     return whole_s + min(overhead_s, (whole_s - parts * part_s) / (parts - 1))
 
 

@@ -20,7 +20,7 @@ def guarded(rig, max_on_s=30.0):
 
 
 def test_a_burst_is_lit_throughout_and_dark_afterwards(rig):
-    frames = burst(rig.camera, guarded(rig), Illumination("green"), SHOT, 3, rig.clock)
+    frames = burst(rig.camera, guarded(rig), Illumination("green"), SHOT, 3, rig.clock, whole_s=SHOT.exposure_s)
     assert [frame.illumination for frame in frames] == [Illumination("green")] * 3
     numbers = [frame.number for frame in frames]
     assert numbers == sorted(set(numbers))
@@ -31,7 +31,7 @@ def test_a_burst_ends_before_the_guard_would_end_it():
     rig = guarded_rig()
     shot = ExposureSettings(9.0)  # of virtual time; the guard's timer runs in real time, which a frame must not reach
     light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock), max_on_s=30.0)
-    frames = burst(rig.camera, light, Illumination("green"), shot, 16, rig.clock)
+    frames = burst(rig.camera, light, Illumination("green"), shot, 16, rig.clock, whole_s=shot.exposure_s)
     assert len(frames) == 3  # a fourth one might last until 36 s
     assert light.illumination is None
 
@@ -56,7 +56,7 @@ def test_split_exposures_have_no_more_light_than_whole_ones(overhead_s, count, p
         light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock))
         camera, shot = SlowCamera(rig.camera, rig.clock, overhead_s), ExposureSettings(0.1 / number)
         begin_s = rig.clock.now_s()
-        frames = burst(camera, light, Illumination("green"), shot, count, rig.clock, parts=number)
+        frames = burst(camera, light, Illumination("green"), shot, count, rig.clock, parts=number, whole_s=0.1)
         lit_s.append(rig.clock.now_s() - begin_s)
         exposed_s.append(sum(frame.exposure_s for frame in frames))
         assert light.given_j_per_cm2 == pytest.approx(light.hazard.dose_j_per_cm2(Illumination("green"), lit_s[-1]))
@@ -106,7 +106,15 @@ class UnpluggedCamera:
 
 def test_an_error_between_two_frames_of_a_burst_turns_the_light_off(rig):
     with pytest.raises(CameraMissing):
-        burst(UnpluggedCamera(rig.camera), guarded(rig), Illumination("green"), SHOT, 3, rig.clock)
+        burst(
+            UnpluggedCamera(rig.camera),
+            guarded(rig),
+            Illumination("green"),
+            SHOT,
+            3,
+            rig.clock,
+            whole_s=SHOT.exposure_s,
+        )
     assert rig.light.illumination is None
 
 
@@ -126,12 +134,12 @@ class CuttingCamera:
 def test_a_burst_longer_than_the_guard_allows_raises_light_limit():
     rig = guarded_rig()
     with pytest.raises(LightLimit):
-        burst(CuttingCamera(rig, 1), rig.light, Illumination("green"), SHOT, 4, rig.clock)
+        burst(CuttingCamera(rig, 1), rig.light, Illumination("green"), SHOT, 4, rig.clock, whole_s=SHOT.exposure_s)
     assert rig.light.illumination is None
 
 
 def test_a_later_frame_that_the_guard_has_ended_is_left_out():
     rig = guarded_rig()
-    frames = burst(CuttingCamera(rig, 3), rig.light, Illumination("green"), SHOT, 4, rig.clock)
+    frames = burst(CuttingCamera(rig, 3), rig.light, Illumination("green"), SHOT, 4, rig.clock, whole_s=SHOT.exposure_s)
     assert len(frames) == 2
     assert rig.light.illumination is None

@@ -318,7 +318,9 @@ class Eyes(RuleBasedStateMachine):
             self.exposed_eyes, self.in_visit, self.lit_s = (eye,), in_visit, 0.0
             light, illumination = self.guarded, Illumination(colour)
             with self.lamp_is_off_after_a_refusal():
-                frames = burst(camera, light, illumination, shot, count, self.times, (eye,), in_visit=in_visit)
+                frames = burst(
+                    camera, light, illumination, shot, count, self.times, (eye,), whole_s=exposure_s, in_visit=in_visit
+                )
                 assert 1 <= len(frames) <= count
                 assert not self.disk.full, "light without a record"
             assert self.lamp.shown is None
