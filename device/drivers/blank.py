@@ -34,6 +34,7 @@ PIDFD_THREAD = os.O_EXCL  # <linux/pidfd.h>
 
 def dark_frame(leds: int) -> bytes:
     """Return the off frame: 4 zero bytes, per LED zero colour at full global brightness, trailing zeros as clocks."""
+    # 0xff is 0b111 and brightness 31: smaller ones add a second, slow PWM that beats with the exposure.
     return bytes(4) + b"\xff\0\0\0" * leds + bytes(max(8, -(-leds // 16)))
 
 

@@ -21,7 +21,6 @@ from device.values import Colour, Illumination
 log = logging.getLogger(__name__)
 
 FULL = 255
-GLOBAL = 0xFF  # 0b111 and 31: smaller values add a second, slow PWM that beats with the exposure
 BLUE_GREEN_RED: tuple[Colour, Colour, Colour] = ("blue", "green", "red")  # byte order on the bus
 
 

@@ -9,7 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from device.calibration.archive import Archive, StoredCalibration
-from device.calibration.monitoring.dark_current_model import DarkCurrentModel, DarkStep, fit_dark_current
+from device.calibration.monitoring.dark_current_model import (
+    REFERENCE_C,
+    DarkCurrentModel,
+    DarkStep,
+    fit_dark_current,
+)
 from device.calibration.procedure.calibration_sequence import CalibrationJob, CalibrationSequence, Operator
 from device.head import target_placer
 from device.sim import calibration_targets
@@ -20,6 +25,11 @@ from device.values import ExposureSettings, Image
 from tests.unit.test_calibration_measurements import small_world
 
 
+def e_per_s_at(model: DarkCurrentModel, temperature_c: float) -> float:
+    """Return the dark current of a model at a temperature, electrons per second."""
+    return model.reference_e_per_s * 2 ** ((temperature_c - REFERENCE_C) / model.doubling_c)
+
+
 def dark_dn_at(kept: StoredCalibration, temperature_c: float) -> Image | None:
     """Return the dark frame at another temperature, (rows, cols), DN; None without a model, a dark frame or a gain."""
     figures = dict(kept.provenance.figures)
@@ -28,7 +38,7 @@ def dark_dn_at(kept: StoredCalibration, temperature_c: float) -> Image | None:
     if "dark_doubling_c" not in figures or dark_dn is None or sensor.gain_e_per_dn is None:
         return None
     model = DarkCurrentModel(figures["dark_25c_e_per_s"], figures["dark_doubling_c"], int(figures["dark_law_steps"]))
-    more_e = (model.e_per_s_at(temperature_c) - model.e_per_s_at(figures["dark_c"])) * figures["dark_map_s"]
+    more_e = (e_per_s_at(model, temperature_c) - e_per_s_at(model, figures["dark_c"])) * figures["dark_map_s"]
     return np.asarray(dark_dn + np.float32(more_e / sensor.gain_e_per_dn))
 
 
@@ -87,7 +97,7 @@ def test_two_dark_steps_define_the_model(doubling_c: float, e_per_s: float, cold
     model = fit_dark_current(DarkStep(c, e_per_s * 2 ** ((c - 25) / doubling_c)) for c in (cold_c, warm_c))
     assert model is not None
     assert model.doubling_c == pytest.approx(doubling_c)
-    assert model.e_per_s_at(warm_c + 5) == pytest.approx(e_per_s * 2 ** ((warm_c - 20) / doubling_c))
+    assert e_per_s_at(model, warm_c + 5) == pytest.approx(e_per_s * 2 ** ((warm_c - 20) / doubling_c))
     assert model.is_plausible
 
 

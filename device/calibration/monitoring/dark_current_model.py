@@ -35,10 +35,6 @@ class DarkCurrentModel:
     doubling_c: float
     steps: int
 
-    def e_per_s_at(self, temperature_c: float) -> float:
-        """Return the dark current at a temperature, electrons per second."""
-        return float(self.reference_e_per_s * 2 ** ((temperature_c - REFERENCE_C) / self.doubling_c))
-
     @property
     def is_plausible(self) -> bool:
         """Return whether the dark current doubles every 4 to 12 C, as is plausible for silicon."""
