@@ -25,11 +25,18 @@ PRESS_REQUEST = "press"  # request text of every press; the record of the captur
 class VisitPictures:
     """Pictures of the visits in the database of the capture store; thread-safe, writers are serialised.
 
-    Each changing method takes an idempotency key first, as in VisitRepository.
+    Each changing method takes an idempotency key first, as in VisitRepository, whose `get` reads a visit.
     """
 
-    def __init__(self, engine: Engine, protocol: Protocol, clock: Clock, requests: IdempotentRequests) -> None:
-        self._engine, self._protocol, self._clock, self._requests = engine, protocol, clock, requests
+    def __init__(
+        self,
+        engine: Engine,
+        protocol: Protocol,
+        clock: Clock,
+        requests: IdempotentRequests,
+        get: Callable[[str], Visit],
+    ) -> None:
+        self._engine, self._protocol, self._clock, self._requests, self._get = engine, protocol, clock, requests, get
 
     def capture_target(self, eye: Eye, key: str | None, id: str | None, slot: str | None) -> CaptureTarget:
         """Return the target of a capture of that eye; without a visit `id` or a slot, the target of a test picture.
@@ -86,8 +93,7 @@ class VisitPictures:
             self._row_writer(key),
             request,
             self.permission(entry.visit),
-            interrupted.planned,
-            interrupted.colours,
+            colours=interrupted.colours,
         )
 
     def permission(self, id: str | None) -> Permit:
@@ -237,10 +243,6 @@ class VisitPictures:
         if row.finished_at is not None:
             session.flush()
             visit_rows.finish(session, self._protocol, row, schema.utc_text(self._clock.wall()))
-
-    def _get(self, id: str) -> Visit:
-        with storage_errors(), Session(self._engine) as session:
-            return visit_queries.read_visit(session, self._protocol, visit_queries.visit_row(session, id))
 
     def _run(self, key: str, request: str, act: Callable[[Session], str]) -> Visit:
         """Run a change once, in a transaction; `act` returns the id of the visit, whose present state is returned."""

@@ -11,7 +11,7 @@ from datetime import date
 from typing import get_args
 
 from pydantic import TypeAdapter
-from sqlalchemy import Integer, case, func, literal_column, select
+from sqlalchemy import case, func, select
 from sqlalchemy.orm import Session
 
 from device.values import ChannelUse
@@ -145,9 +145,8 @@ def read_visit(session: Session, protocol: Protocol, row: VisitRow) -> Visit:
 def damaged(session: Session, protocol: Protocol) -> int:
     """Return the number of visits that cannot be read."""
     many, last = 0, 0
-    number = literal_column("visits.rowid", Integer)
     while True:
-        query = select(number, VisitRow).where(number > last).order_by(number).limit(PAGE_ROWS)
+        query = select(VISIT_ROWID, VisitRow).where(last < VISIT_ROWID).order_by(VISIT_ROWID).limit(PAGE_ROWS)
         rows = session.execute(query).all()
         if not rows:
             return many

@@ -29,7 +29,7 @@ class VisitRepository:
     def __init__(self, engine: Engine, protocol: Protocol, clock: Clock) -> None:
         self.protocol, self.clock, self._engine = protocol, clock, engine
         self.requests = IdempotentRequests(engine, clock)
-        self.pictures = VisitPictures(engine, protocol, clock, self.requests)
+        self.pictures = VisitPictures(engine, protocol, clock, self.requests, self.get)
 
     def begin(self, key: str, number: str | None = None) -> Visit:
         """Begin a visit of the patient with that number, known or new; without a number, of a new patient.
