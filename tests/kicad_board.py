@@ -1,12 +1,11 @@
 """Pads, holes and outline of a KiCad board, read from the text of the .kicad_pcb file, without KiCad."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from hardware.gate.netlist import Pin
 from hardware.gate.s_expression import child, children, numbers, parse
+from tests.project_files import text
 
-BOARDS = {name: Path(__file__).with_name(f"{name}.kicad_pcb") for name in ("gate", "ring")}
 MIDDLE_MM = 100.0  # of the ring board, on KiCad's sheet
 Place = tuple[float, float]
 
@@ -34,7 +33,7 @@ def read_board(name: str) -> Board:
 
     Footprints stand unrotated, so that a pad's place is the sum of two.
     """
-    root = parse(BOARDS[name].read_text(encoding="utf-8"))
+    root = parse(text(f"hardware/gate/{name}.kicad_pcb"))
     pads = dict[Pin, Pad]()
     holes = list[tuple[float, float, float]]()
     for one in children(root, "footprint"):

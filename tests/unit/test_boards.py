@@ -9,9 +9,9 @@ import pytest
 
 from device.config.head_file import ChainSpec, load_head
 from device.optics.matrix import led_positions_mm
-from hardware.gate.board import Board, Pad, read_board
 from hardware.gate.netlist import Pin, read
 from hardware.parts.dimensions import Bought
+from tests.kicad_board import Board, Pad, read_board
 from tests.project_files import ROOT, text
 
 RING_PARTS = {"U5", "R8", "C7", "C8", "C9", *(f"D{number}" for number in range(1, 9))}

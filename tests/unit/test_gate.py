@@ -7,9 +7,9 @@ from functools import cache
 import pytest
 
 from device.config.head_file import OUTPUT_MA, load_head
-from hardware.gate.board import read_board
 from hardware.gate.failures import GATE, Failure, after_stop, failures, table
 from hardware.gate.netlist import Netlist, Pin, read
+from tests.kicad_board import read_board
 from tests.project_files import ROOT, text
 from tests.unit.test_hardware_documents import BUSES, HEADER, parts
 
