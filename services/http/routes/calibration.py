@@ -13,7 +13,7 @@ from device.errors import CalibrationError, HeadMismatch
 from device.head import fault_names, kind_of
 from device.optics.trial_lens import PowerVector
 from services.errors import Busy
-from services.http.authentication import IDLE_TIMEOUT_S, PinAuthenticator
+from services.http.authentication import PinAuthenticator
 from services.http.dependencies import login_renewal, login_required
 from services.http.media import JpegResponse, file_responses, no_picture
 from services.http.problem_responses import error_text
@@ -171,9 +171,7 @@ def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
         name=spec.name,
         kind=kind_of(spec),
         white_dn=spec.camera.white_dn,
-        shape=(spec.camera.rows, spec.camera.cols),
         mishaps=list(fault_names()) if spec.camera.backend == "sim" else [],
-        idle_s=IDLE_TIMEOUT_S,
     )
 
 

@@ -132,7 +132,7 @@ class CalibrationAnswer(ResponseBody):
     `error`: last error of the procedure. `needed`: error because of which a calibration is required. `unfinished`:
     targets whose measurement can be resumed. `made`: calibration of the last run; `kept`: the newest calibrations and
     the one in force. `mishaps`: faults that can be injected into a simulated head. `white_dn`: counts of a saturated
-    pixel. `shape`: rows and columns of the sensor. `idle_s`: idle timeout of the login in seconds.
+    pixel.
     """
 
     state: str
@@ -149,6 +149,4 @@ class CalibrationAnswer(ResponseBody):
     name: str
     kind: str
     white_dn: int
-    shape: tuple[int, int]
     mishaps: list[str]
-    idle_s: float
