@@ -138,11 +138,6 @@ class CalibrationMonitor:
             return error
         return None
 
-    def forget_results(self) -> None:
-        """Forget the results of all checks; queued captures stay queued."""
-        self._sights = ()
-        self._refractions = ()
-
     def _publish_changes(self) -> None:
         """Publish the findings when the set of failed ones has changed."""
         failed = tuple(finding.name for finding in self.findings if not finding.ok)

@@ -23,11 +23,11 @@ from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import WireState
 from services.instrument.progress import Progress
 from services.instrument.record_origin import CaptureOrigin
-from services.instrument.resumption import ResumedTarget, refuse_targets, resumed_presses
+from services.instrument.resumption import ResumedTarget, resumed_presses
 from services.instrument.shutter_button import ShutterButton
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import Watchdog
-from services.records.capture import BUDGET_S, Capture
+from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
 from services.records.capture_store import CaptureStore
 from services.records.capture_target import FRAMES, TEST_PICTURE, CaptureTarget
@@ -52,8 +52,8 @@ class ExamService:
         plans: Path,
         on_failure: Callable[[], None],
         watchdog: Watchdog,
-        budget_s: Callable[[], float] = lambda: BUDGET_S,
-        resumed_target: ResumedTarget = refuse_targets,
+        budget_s: Callable[[], float],
+        resumed_target: ResumedTarget,
     ) -> None:
         self.head = head
         self.store = store

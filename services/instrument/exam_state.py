@@ -1,6 +1,6 @@
 """States of the exam, the events that change them, and the one function that applies an event.
 
-The diagram is drawn by `diagram` from the table; a test compares it with this docstring and the README of this folder.
+The diagram is that of the table; a test draws it and compares it with this docstring.
 
     stateDiagram-v2
         [*] --> STARTING
@@ -34,8 +34,8 @@ WireState = Literal["starting", "aim", "busy", "making"]  # what status, events 
 class ExamState(Enum):
     """State of the exam: the capture that is being made, and the press that waits or is exposed beside it.
 
-    Each state has a `meaning`, its `wire_state`, `captures` (number of captures in progress, 0 to 2) and whether it
-    `accepts_press`.
+    Each state has its `wire_state`, `captures` (number of captures in progress, 0 to 2) and whether it `accepts_press`.
+    Its text differs from that of each state with equal attributes, which would be an alias without it.
     """
 
     STARTING = "FFT plans are made", "starting", 0, True
@@ -49,8 +49,8 @@ class ExamState(Enum):
     MAKING_TWO = "two exposed captures", "busy", 2, False
     ENDED = "no further exposure; waiting presses are answered; the last state stays on the wire", None, 0, False
 
-    def __init__(self, meaning: str, wire_state: WireState | None, captures: int, accepts_press: bool) -> None:
-        self.meaning, self.wire_state, self.captures, self.accepts_press = meaning, wire_state, captures, accepts_press
+    def __init__(self, _: str, wire_state: WireState | None, captures: int, accepts_press: bool) -> None:
+        self.wire_state, self.captures, self.accepts_press = wire_state, captures, accepts_press
 
     @property
     def has_press(self) -> bool:
@@ -102,14 +102,3 @@ def transition(state: ExamState, event: ExamEvent) -> ExamState:
         return TRANSITIONS[state, event]
     except KeyError:
         raise RuntimeError(f"{event.name} is not declared in the state {state.name}") from None
-
-
-def diagram() -> str:
-    """Return the state diagram as Mermaid text, drawn from the table; END is drawn once for all running states."""
-    events: dict[tuple[str, str], list[str]] = {}
-    for (state, event), after in TRANSITIONS.items():
-        if event is not ExamEvent.END:
-            events.setdefault((state.name, after.name), []).append(event.name)
-    inner = [f"        {before} --> {after} : {' or '.join(names)}" for (before, after), names in events.items()]
-    frame = "stateDiagram-v2", "    [*] --> STARTING", "    state running {"
-    return "\n".join([*frame, *inner, "    }", "    running --> ENDED : END"])

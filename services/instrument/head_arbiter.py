@@ -259,8 +259,8 @@ class HeadArbiter:
     """Arbiter that gives the head to the exam or to a calibration run, and what other parts read of them.
 
     The function `exam` opens the head with the calibration in force, `bench` opens it without one. If the calibration
-    is missing or not valid, a calibration run owns the head and `calibration_error` holds the error; the HTTP server
-    runs in both cases.
+    is missing or not valid, a calibration run owns the head and `owner.calibration_error` holds the error; the HTTP
+    server runs in both cases.
     """
 
     def __init__(self, context: AppContext, exam: Callable[[], ExamService], bench: Callable[[], Bench]) -> None:
@@ -281,11 +281,6 @@ class HeadArbiter:
         return exam
 
     @property
-    def current_exam(self) -> ExamService | None:
-        """The exam, or None while it does not own the head."""
-        return self.owner.exam
-
-    @property
     def head(self) -> Head | None:
         """The head of the exam, or None while the exam does not own it."""
         return exam.head if (exam := self.owner.exam) is not None else None
@@ -294,11 +289,6 @@ class HeadArbiter:
     def findings(self) -> tuple[Finding, ...]:
         """The findings of the calibration monitor; empty while the exam does not own the head."""
         return exam.calibration_monitor.findings if (exam := self.owner.exam) is not None else ()
-
-    @property
-    def calibration_error(self) -> DiffuscopeError | None:
-        """The error because of which a calibration run owns the head; None if there is none."""
-        return self.owner.calibration_error
 
     @property
     def is_idle(self) -> bool:

@@ -8,7 +8,6 @@ from datetime import datetime
 
 from device.errors import DiffuscopeError, FrameError, StoreError
 from device.values import Calibration, Colour, Frame
-from services.errors import RecordNotFound
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.capture import Press
 from services.instrument.press_exposure import Exposure
@@ -75,11 +74,6 @@ def resumed_presses(journal: CaptureJournal, target_of: ResumedTarget) -> tuple[
         future.set_running_or_notify_cancel()
         found.append(ResumedPress(Press(future, eye, target, capture.key), capture))
     return tuple(found)
-
-
-def refuse_targets(interrupted: ResumableCapture) -> CaptureTarget:
-    """Raise RecordNotFound: the targets of captures of an earlier run are not known."""
-    raise RecordNotFound(f"the target of {interrupted.press.id} is not known", "Take the picture again.")
 
 
 def give_up(journal: CaptureJournal, id: str, error: DiffuscopeError) -> None:

@@ -22,7 +22,7 @@ DARK_POLL_S = 0.02
 def read_status(arbiter: HeadArbiter) -> InstrumentStatus:
     """Return the present status; during a calibration the head is not read, and its readings are None."""
     head = arbiter.head
-    exam = arbiter.current_exam
+    exam = arbiter.owner.exam
     chips = head.chips if head is not None else Chips()
     bus = (head if head is not None else arbiter.context).spec.bus
     battery = chips.battery
@@ -31,7 +31,7 @@ def read_status(arbiter: HeadArbiter) -> InstrumentStatus:
     return InstrumentStatus(
         state=arbiter.owner.state,
         problem=arbiter.owner.problem,
-        calibration_error=arbiter.calibration_error or _calibration_failure(findings),
+        calibration_error=arbiter.owner.calibration_error or _calibration_failure(findings),
         findings=findings,
         battery=_reading(lambda: battery.read().fraction) if battery else None,
         emptiest=bus.emptiest if bus else 0.0,
@@ -62,7 +62,7 @@ def interrupted_captures(arbiter: HeadArbiter, visits: VisitRepository) -> list[
     Discards those whose slot has a newer capture or whose visit is finished. Test pictures are returned in one run of
     the instrument only.
     """
-    exam = arbiter.current_exam
+    exam = arbiter.owner.exam
     if exam is None:
         return []
     exam.capture_journal.discard(lambda capture: _is_over(capture, visits))

@@ -20,7 +20,6 @@ from services.instrument.guided_run import (
     RunErrors,
     RunOutcome,
     RunParts,
-    RunState,
     run_guided,
 )
 from services.instrument.trial_lens_measurement import LensBench, LensCheck, TrialLensOutcome
@@ -44,7 +43,6 @@ class TrialLensRequest:
 
 
 LensRun = GuidedRun[int, LensReading, TrialLensRequest]  # a step is the number of a lens in the bench, from 0
-LensState = RunState[int, LensReading, TrialLensRequest]
 
 
 class TrialLensSession(GuidedSession[int, LensReading, TrialLensRequest]):

@@ -43,6 +43,7 @@ from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_pa
 from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
+from services.records.capture_target import TEST_PICTURE
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.upload_queue import UploadReceipt
 from services.research.frontier import measure_scene
@@ -280,6 +281,7 @@ def _owner(
             house.on_failure,
             Watchdog(None),
             lambda: explorer.budget_s,
+            lambda _: TEST_PICTURE,
         )
 
     def bench() -> Bench:

@@ -39,6 +39,7 @@ from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter
 from services.instrument.watchdog import Watchdog
+from services.records.capture import BUDGET_S
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import Protocol, load_protocol
@@ -222,7 +223,8 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
             plans,
             died.set,
             Watchdog(watchdog),
-            resumed_target=pictures.resumed_target,
+            lambda: BUDGET_S,
+            pictures.resumed_target,
         )
         undo.callback(exam.close)
         undo.callback(clock.gate.set)

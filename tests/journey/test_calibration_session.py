@@ -27,7 +27,9 @@ from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
 from services.instrument.watchdog import Watchdog
+from services.records.capture import BUDGET_S
 from services.records.capture_store import CaptureStore
+from services.records.capture_target import TEST_PICTURE
 from tests.journey.conftest import SMALL_HEAD, until
 from tests.simulated import world
 from tests.unit.test_trial_lenses import WHO
@@ -40,6 +42,7 @@ TINY = (
     .replace("haemorrhages = 3", 'kind = "point"')  # saves the simulation of vessels
 )
 CHIPS = '\n[bus]\nbackend = "sim"\nthermometer = 0x48\nmemory = 0x50\n'
+ALONE = (lambda: BUDGET_S, lambda _: TEST_PICTURE)  # no other time budget, no visits
 STANDS = ("cap", "screen", "point")
 
 
@@ -138,7 +141,7 @@ def make_station(tmp_path: Path, plans: Path) -> Iterator[MakeStation]:
                 if stale():
                     raise CalibrationStale("the point has moved by 3 pixels")
                 head = open_head(with_calibration(spec, root), clock, ledger)
-                return ExamService(head, store, context.event_bus, clock, plans, died.set, Watchdog(None))
+                return ExamService(head, store, context.event_bus, clock, plans, died.set, Watchdog(None), *ALONE)
 
             def bench() -> Bench:
                 benches.append(opened := open_bench(spec, clock))
@@ -417,7 +420,7 @@ def lasting(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
     with CaptureStore(folder / "store", reserve_bytes=0) as store:
         context = AppContext(spec, Archive(folder / "archive"), store, EventBus(), clock, Watchdog(None), Event().set)
         head = open_head(spec, clock, MemoryLedger(clock))
-        exam = ExamService(head, store, context.event_bus, clock, plans, context.on_failure, Watchdog(None))
+        exam = ExamService(head, store, context.event_bus, clock, plans, context.on_failure, Watchdog(None), *ALONE)
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(spec, clock))
         station = Station(owner, create_app(owner, PinAuthenticator(folder / "pin.json", clock)).http, clock, [])
         station.set_pin()

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from device.clock import VirtualClock
+from device.clock import Clock, VirtualClock
 from device.config.image_files import as_raw, read_image
 from device.errors import CameraMissing, DiffuscopeError, PsfError, SpecError
 from device.head import Head, open_head, recording_spec
@@ -22,11 +22,12 @@ from services.imaging.picture_files import raw_tiff, read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
-from services.instrument.resumption import WHOLE
+from services.instrument.resumption import WHOLE, ResumedTarget
 from services.instrument.watchdog import Watchdog
-from services.records.capture import Capture
+from services.records.capture import BUDGET_S, Capture
+from services.records.capture_journal import ResumableCapture
 from services.records.capture_store import CaptureStore
-from services.records.capture_target import CaptureTarget
+from services.records.capture_target import TEST_PICTURE, CaptureTarget
 from tests import scenes
 from tests.journey.asking import live_picture
 
@@ -77,11 +78,22 @@ def play(tmp_path: Path, plans: Path) -> Iterator[Played]:
             store = undo.enter_context(
                 CaptureStore(tmp_path / f"store{len(list(tmp_path.iterdir()))}", reserve_bytes=0)
             )
-            exam = ExamService(head, store, EventBus(), clock, plans, lambda: None, Watchdog(None))
+            exam = begun(head, store, EventBus(), clock, plans)
             undo.callback(exam.close)
             return exam.press("OD").result(60), exam
 
         yield played
+
+
+def begun(
+    head: Head,
+    store: CaptureStore,
+    event_bus: EventBus,
+    clock: Clock,
+    plans: Path,
+    target_of: ResumedTarget = lambda _: TEST_PICTURE,
+) -> ExamService:
+    return ExamService(head, store, event_bus, clock, plans, lambda: None, Watchdog(None), lambda: BUDGET_S, target_of)
 
 
 def opened(folder: Path) -> Head:
@@ -123,21 +135,16 @@ def test_a_press_on_a_recording_that_is_resumed_with_its_one_frame_is_whole(
 ) -> None:
     key = "0" * 16
     with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
-        exam = ExamService(opened(folder), store, EndsAtVerdict(), VirtualClock(), plans, lambda: None, Watchdog(None))
+        exam = begun(opened(folder), store, EndsAtVerdict(), VirtualClock(), plans)
         with pytest.raises(DiffuscopeError, match="unexpectedly"):
             exam.press("OD", key).result(60)
         exam.close()
     with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
-        exam = ExamService(
-            opened(folder),
-            store,
-            EventBus(),
-            VirtualClock(),
-            plans,
-            lambda: None,
-            Watchdog(None),
-            resumed_target=lambda interrupted: CaptureTarget(frames=interrupted.planned, colours=interrupted.colours),
-        )
+
+        def same_colours(interrupted: ResumableCapture) -> CaptureTarget:
+            return CaptureTarget(colours=interrupted.colours)
+
+        exam = begun(opened(folder), store, EventBus(), VirtualClock(), plans, same_colours)
         capture = exam.press("OD", key).result(60)
         exam.close()
     assert WHOLE in capture.report.warnings

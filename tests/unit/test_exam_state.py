@@ -8,7 +8,7 @@ from textwrap import indent
 import pytest
 
 from services.instrument import exam_state
-from services.instrument.exam_state import TRANSITIONS, ExamEvent, ExamState, diagram, transition
+from services.instrument.exam_state import TRANSITIONS, ExamEvent, ExamState, transition
 from services.instrument.time_budget import MAX_IN_PROGRESS
 
 README = Path(exam_state.__file__).with_name("README.md")
@@ -56,6 +56,17 @@ def test_light_for_a_capture_belongs_to_the_exposing_states_only() -> None:
 
 def test_the_names_on_the_wire_stay() -> None:
     assert {state.wire_state for state in ExamState} == {"starting", "aim", "busy", "making", None}
+
+
+def diagram() -> str:
+    """Return the state diagram as Mermaid text, drawn from the table; END is drawn once for all running states."""
+    events: dict[tuple[str, str], list[str]] = {}
+    for (state, event), after in TRANSITIONS.items():
+        if event is not ExamEvent.END:
+            events.setdefault((state.name, after.name), []).append(event.name)
+    inner = [f"        {before} --> {after} : {' or '.join(names)}" for (before, after), names in events.items()]
+    frame = "stateDiagram-v2", "    [*] --> STARTING", "    state running {"
+    return "\n".join([*frame, *inner, "    }", "    running --> ENDED : END"])
 
 
 def test_the_diagram_of_the_docstring_is_drawn_from_the_table() -> None:

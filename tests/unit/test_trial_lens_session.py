@@ -24,14 +24,15 @@ from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, ExposureSettings, HeadIdentity, Illumination
 from services.errors import Busy
-from services.instrument.guided_run import RunOutcome, RunParts
+from services.instrument.guided_run import RunOutcome, RunParts, RunState
 from services.instrument.trial_lens_measurement import LensBench, LensCheck, TrialLensOutcome
-from services.instrument.trial_lens_run import LensState, TrialLensRequest, TrialLensSession
+from services.instrument.trial_lens_run import TrialLensRequest, TrialLensSession
 from services.instrument.watchdog import Watchdog
 from tests.journey.conftest import GateClock, until
 from tests.simulated import small_head_toml, world
 from tests.unit.test_trial_lenses import WHO, readings
 
+LensState = RunState[int, LensReading, TrialLensRequest]
 POINT = '[sim]\n\n[sim.object]\nkind = "point"\n'  # no vessels to simulate
 
 

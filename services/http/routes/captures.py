@@ -81,7 +81,7 @@ def captures_router(store: CaptureStore, arbiter: HeadArbiter) -> APIRouter:
         picture that is shown first, reduced, and of a capture in progress its quick look; `green.jpg` is `picture.png`
         reduced. 404 for an unknown capture or file, 500 for a damaged one.
         """
-        exam = arbiter.current_exam
+        exam = arbiter.owner.exam
         quick = exam.quick(id) if name == "quick.jpg" and exam is not None else None
         try:
             content = store.read(id, name)
