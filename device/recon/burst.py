@@ -58,12 +58,12 @@ class JoinedFrame:
 class SeenFrame:
     """A frame that is ready to be joined: `BurstJoiner.see` makes it, before the other frames are known.
 
-    `light`: image of the light in DN above dark (in JoinedFrame a ratio), and `good`: mask of the good pixels, both
+    `light_dn`: image of the light in DN above dark, and `good`: mask of the good pixels, both
     (rows, cols) of the sensor; `picture` on the grid of the registration; `mean_dn`: mean light in DN; `saturated`:
     share of saturated pixels.
     """
 
-    light: Image
+    light_dn: Image
     good: Mask
     picture: Image
     mean_dn: float
@@ -175,7 +175,7 @@ class BurstJoiner:
         sigma = SMOOTH_PX / self._stage.grid.n
         picture = ndimage.gaussian_filter(seen.picture * field, sigma) / near * field
         blurred = to_sensor(stage.model.blur(picture.astype(np.float32)), self._whole)
-        along, _, energy, _, _ = kernels.flat_fit_sums(seen.light, blurred, good)  # least squares
+        along, _, energy, _, _ = kernels.flat_fit_sums(seen.light_dn, blurred, good)  # least squares
         return blurred, along / energy if energy > 0 else 0.0
 
     def _join(self, seen: dict[int, SeenFrame], field: Image, uses: Sequence[FrameUse]) -> JoinedFrame:
@@ -195,7 +195,7 @@ class BurstJoiner:
             assert shift is not None
             good[:] = frame.good
             smooth, scale = (base, base_scale) if frame is reference else self._smooth(frame, good, field, near)
-            kernels.subtract_scaled(frame.light, smooth, scale, good, detail)
+            kernels.subtract_scaled(frame.light_dn, smooth, scale, good, detail)
             add_moved_back(detail, good, shift, shares[k], reference.mean_dn / frame.mean_dn, joined, weights)
         kernels.finish_mean(joined, weights, MIN_WEIGHT, base, base_scale)
         light = total_dn / reference.mean_dn

@@ -121,9 +121,10 @@ class BurstReconstructor:
         prepared: Mapping[int, PreparedFrame] | None = None,
         refract: bool = True,
     ) -> Iterator[Step]:
-        """Yield the quick look of the first frame, RoundDone after each frame and round, and the picture of the burst.
+        """Yield the quick look of the first frame, RoundDone after frames and rounds, and the picture of the burst.
 
-        The deadline moves by the time until the consumer continues after RoundDone. A burst of one usable frame
+        Each frame that is not prepared and each round is followed by RoundDone. The deadline moves by the time until
+        the consumer continues after it. A burst of one usable frame
         gives the picture of that frame; a deadline that leaves no time to join them gives that of the first.
 
         Parameters

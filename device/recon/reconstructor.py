@@ -98,7 +98,7 @@ class StageResult:
 
 @dataclass(frozen=True)
 class RoundDone:
-    """A round of the last stage is done: the consumer may do other work before it continues the iteration."""
+    """A round of the last stage is done, or a frame of a burst joined: the consumer may do other work meanwhile."""
 
 
 ROUND_DONE = RoundDone()
@@ -124,7 +124,7 @@ def default_schedule(calibration: Calibration, shape: tuple[int, int], index: in
 
 
 class DurationEstimate:
-    """Estimate of the duration of a step in seconds: the maximum of its last 12 measured durations."""
+    """Estimate of the duration of a step in seconds: the maximum of the last 12, some halved since."""
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque(maxlen=12)
@@ -135,7 +135,7 @@ class DurationEstimate:
 
     @property
     def seconds(self) -> float:
-        """Maximum of the last 12 durations; 0.0 before the first run."""
+        """Maximum of the stored durations; 0.0 before the first run."""
         return max(self._seen, default=0.0)
 
     def halve_maximum(self) -> None:

@@ -32,7 +32,7 @@ def test_the_test_of_the_psf_shares_the_otf_of_the_refraction() -> None:
 def test_a_frame_that_waits_for_its_burst_takes_five_bytes_a_pixel() -> None:
     joiner = BurstJoiner(calibrated(), SHAPE, PLANNER, SystemClock())
     seen = joiner.see(frame_through(caustic_of_eye(0.0), 1, 1.0, 1), dark())
-    assert seen.light.nbytes + seen.good.nbytes == 5 * SHAPE[0] * SHAPE[1]
+    assert seen.light_dn.nbytes + seen.good.nbytes == 5 * SHAPE[0] * SHAPE[1]
 
 
 def test_the_server_starts_without_the_package_of_a_calibration() -> None:

@@ -1,4 +1,4 @@
-"""Frame quality: the verdict on one raw frame, and its cause, before the reconstruction.
+"""Verdicts: on a raw frame, with its cause, before the reconstruction, and on its picture after it (assess_picture).
 
 A coarse, linear solution of the frame answers five questions: is it too bright or too dark, did the light come through
 the field or from everywhere, is a part of the field dark, is there light that is not from the retina, is there less

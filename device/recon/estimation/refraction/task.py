@@ -12,8 +12,8 @@ from device.recon.model.kernels import Pixels, Places
 class RefractionTask:
     """Estimation of mean sphere and field edge of a frame and, `with_cylinder`, of its cylinder; begins at once.
 
-    `counts`, `dark` and `defects` as for `RefractionEstimator.find`. Tasks with the same `lock` run one after the
-    other: an estimator holds the state of one frame. Any thread may ask for the results.
+    `frame`: counts, dark frame and defects, as for `RefractionEstimator.find`. Tasks with the same `lock` run one after
+    the other: an estimator holds the state of one frame. Any thread may ask for the results.
     """
 
     def __init__(
