@@ -7,8 +7,8 @@
 The chain keeps its last colour while it has power, so a killed process leaves the LEDs on. The guard reads leases from
 standard input: `lit 1.5` (turn off in 1.5 s unless a new lease arrives), `dark` (no lease), `watch 12 13` (threads
 of its parent, whose end is the parent's); it answers each with `ok`, or `old` on a kernel that cannot watch threads.
-Without --chip the messages of both kinds are sent: that of the TLC5971 first, which then ignores the other one, as no
-word at a packet's place in it begins with the write command. A matrix of APA102 sees the other message last.
+Without --chip the messages of both kinds are sent, that of the TLC5971 first: these chips ignore the other one, which
+has no write command where a packet begins. A matrix of APA102 receives its own message last.
 Exit status 1: the device does not exist, or does not accept the frame.
 """
 
@@ -105,7 +105,8 @@ def guard(device: str, leds: int, chip: str) -> None:
 
     The parent is watched too, because a forked process may hold its pipe open. After a lease has expired, the off frame
     is repeated every 50 ms until the next message: the parent may have been stopped between its lease and its light.
-    So it is after the end of a watched thread, which comes first: the parent's other threads may still be writing.
+    It is also repeated after the end of a watched thread, which ends before the process: other threads of the parent
+    may still be writing.
     """
     prioritise()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -137,7 +138,7 @@ def guard(device: str, leds: int, chip: str) -> None:
 
 
 def main() -> int:
-    """Parse the arguments and run `blank`, or `guard` with --guard; return the exit status, 1 after an OSError."""
+    """Run `blank`, `guard` with --guard, or `blank_with_retries` with --insist; return 1 after an OSError, else 0."""
     parser = argparse.ArgumentParser(description="Darken the ring of LEDs.")
     parser.add_argument("--device", required=True, help="the SPI device, such as /dev/spidev0.0")
     parser.add_argument("--leds", type=int, default=LEDS, help="how many APA102 LEDs the chain has")

@@ -12,7 +12,10 @@ class GpioButton:
         self._since_s: float | None = None
 
     def pressed_since_s(self) -> float | None:
-        """Return the clock time, s, at which the current press was first polled; None if not pressed. BusFault."""
+        """Return the clock time, s, at which the current press was first polled; None if not pressed.
+
+        BusFault if the line cannot be read.
+        """
         if not self._line.get():
             self._since_s = None
         elif self._since_s is None:
