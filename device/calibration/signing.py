@@ -34,7 +34,7 @@ from device.errors import CalibrationDamaged, CalibrationFormat, CalibrationUntr
 
 MAGIC = "diffuscope-calibration"
 FORMAT = 1
-MAX_BYTES = 2**30  # eleven PSFs of twelve megapixels are 0.6 of it
+MAX_BYTES = 2**30  # eleven PSFs of 3040 x 4056 float32 are half of it
 SIGNATURE = re.compile("[0-9a-f]{128}")
 MAX_FILES, LONGEST_LINE = 64, 256
 RETRY_REMEDY = "Copy the file again, or ask the service centre for it again."
@@ -154,7 +154,10 @@ def verify_export(whole: bytes, name: str, trusted: tuple[Signer, ...]) -> tuple
 
 
 def _split_header(whole: bytes, name: str) -> tuple[str, str, str, str, bytes]:
-    """Return type line, fingerprint, displayable signer name, signature and zip archive; CalibrationDamaged."""
+    """Return type line, fingerprint, displayable signer name, signature and zip archive.
+
+    CalibrationDamaged if a line is missing or too long, or the first one names another type of file.
+    """
     lines = []
     at = 0
     for _ in range(4):
