@@ -10,9 +10,9 @@ from device.light_safety.hazard import Limits, light_limits
 from device.optics.budget import Design
 from device.optics.eye import reflex_free_mm
 from device.optics.illumination import LED, Led, led_at
-from device.optics.light_budget import ENOUGH_E, chain, log_sd, product
+from device.optics.light_budget import CELL_UM, ENOUGH_E, chain, log_sd, product
 from device.values import Colour
-from services.workshop.light_report import expected_beam, half_period_um, limit_shares, permitted_level
+from services.workshop.light_report import GUARD, expected_beam, half_period_um, limit_shares, permitted_level
 from services.workshop.optics_report import widest_iris_mm
 
 BELOW = 1.645  # standard deviations above the 5 % quantile of a log-normal product
@@ -49,7 +49,11 @@ FRAMES = (1, 2, 4)
 
 @dataclass(frozen=True)
 class Candidate:
-    """One head of the search with its light at the drive that the limits permit of a measured ring."""
+    """One head of the search with its light at the drive `level` (0 to 1) that the limits permit of a measured ring.
+
+    `light_e`: electrons in a cell of CELL_UM, `low_e` its 5 % quantile over builds. `half_period_um`: resolved on the
+    retina. `limit`: the light limit of which most is used, and `largest_share` how much of it, 0 to 1.
+    """
 
     choice: LedChoice
     leds: int
@@ -147,8 +151,8 @@ def table(base: Design, most: int = 25) -> str:
     found = search(base)
     enough = [candidate for candidate in found if candidate.light_e >= ENOUGH_E]
     lines = [
-        f"{len(found)} heads, {len(enough)} of them with at least {ENOUGH_E:g} electrons in a cell of 10 um; "
-        "measured ring, guard factor 1.3",
+        f"{len(found)} heads, {len(enough)} of them with at least {ENOUGH_E:g} electrons in a cell of {CELL_UM:g} um; "
+        f"measured ring, guard factor {GUARD:g}",
         "another iris than the head's is another print, another ring another LED cap and board",
         f"{'LED':<17}{'colour':<7}{'n':>3}{'ring':>7}{'iris':>6}{'ms':>5}{'x':>3}{'drive':>7}{'electrons':>10}"
         f"{'5 %':>8}{'um':>5}  most used limit",

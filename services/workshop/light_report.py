@@ -77,9 +77,9 @@ def expected_uw(design: Design) -> float:
 
 
 def expected_beam(design: Design) -> Beam:
-    """Return the beam of a measured ring, times its guard factor; without a measurement that of the light budget.
+    """Return the beam in an eye whose pupil takes in the whole ring, times the guard factor of its measurement.
 
-    In an eye that takes in the whole ring.
+    Without a measurement: that of the light budget, times GUARD.
     """
     table = design.radiometry
     measured = design.measured
