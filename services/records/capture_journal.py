@@ -66,8 +66,9 @@ class CaptureJournal:
     """Journal with one small file, and a folder of frames, per capture in progress.
 
     Entries that exist at the opening belong to interrupted captures; an entry whose capture is in the store is deleted
-    instead, with its frames. Those with a lit frame are in `resumable`, until `end` or `fail`, the others in
-    `interrupted`. So are captures that the store quarantined at its opening; one without an entry has only id and eye.
+    instead, with its frames. A readable entry with a lit frame is in `resumable`, until `end`, `fail` or MAX_ATTEMPTS.
+    The others are in `interrupted`, as are captures that the store quarantined at its opening, which have only id and
+    eye without an entry.
     An entry without a visit is reported in one run only: `mark_reported`. In a read-only store nothing is resumed.
     """
 
@@ -77,7 +78,7 @@ class CaptureJournal:
         self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
             atomic_io.make_folder(self._folder)
-            entries = {path.stem: _entries(path) for path in files_in(self._folder, "*.json")}
+            entries = {path.stem: _entry(path) for path in files_in(self._folder, "*.json")}
         found = {id: _capture(id, entry) for id, entry in entries.items()}
         self._keys = {id: _key(entry) for id, entry in entries.items()}
         for id in [id for id in found if _is_kept(store, id)]:
@@ -136,7 +137,9 @@ class CaptureJournal:
             self.discard(lambda press: self._keys.get(press.id) == key)
 
     def fail(self, id: str) -> None:
-        """Delete the frames of a capture that has failed, and its entry; one that was resumed is interrupted then.
+        """Delete the frames and the entry of a capture that has failed; one that was resumed keeps its entry.
+
+        It is in `interrupted` from then on.
 
         StoreError if the disk refuses.
         """
@@ -253,8 +256,8 @@ def _attempts(folder: Path) -> int:
     return len(list(folder.glob(_ATTEMPT.format("*"))))
 
 
-def _entries(path: Path) -> JsonObject:
-    """Return the entries of a journal file; none if it is incomplete or has changed."""
+def _entry(path: Path) -> JsonObject:
+    """Return the content of a journal file; an empty entry if it is incomplete or has changed."""
     try:
         return digested_json.decoded(path.read_bytes())
     except ValueError:

@@ -21,10 +21,10 @@
     replaced/                     what a restored backup replaced (restoration.py)
     .lock                         lock of the commands that change the folder
 
-Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
-folder that has all files of a capture and no row may have lost its row: the next opening restores the row from the
-record in the folder (recovery.py). Without a valid record the store neither moves nor removes it, and
-`Quarantine.orphans` lists it.
+Commit protocol: files, fsync, atomic rename of the folder, and then the row. A new row therefore has its
+files; large ones may be removed later to make room (removed_captures.py). A folder that has all files of a capture and
+no row may have lost its row: the next opening restores the row from the record in the folder (recovery.py). Without a
+valid record the store neither moves nor removes it, and `Quarantine.orphans` lists it.
 """
 
 import hashlib
@@ -155,9 +155,9 @@ class CaptureStore:
         `write_rows` adds rows in the same transaction. `request`: reference of the press, as
         `IdempotentRequests.reference` returns it, stored in the record of the capture. Quarantined captures are deleted
         if their space is needed; files that are on the disk already are linked.
-        Errors: StoreFull, StoreLocked (everything written is removed); StoreError (the id exists; or a write failed:
-        the next opening quarantines the folder if it is incomplete and has no row); SettingError (invalid id, file name
-        or report, or no files).
+        Errors: StoreFull, StoreLocked (everything written is removed); StoreReadOnly; StoreError (the id exists; or a
+        write failed: the next opening quarantines the folder if it is incomplete and has no row); SettingError (invalid
+        id, file name or report, or no files).
         """
         _refuse_names(capture.id, files)
         capture = capture.with_files({name: _sha256(content) for name, content in files.items()})
@@ -264,7 +264,7 @@ class CaptureStore:
         """Raise StoreFull or StoreReadOnly if a capture could not be stored: called before its light.
 
         A locked database is found by `DoseLedgerStore.reserve`, which writes the dose before the light, too.
-        StoreLocked also if room must be made meanwhile.
+        StoreLocked or StoreError if room must be made and the database or the disk refuses.
         """
         schema.refuse_if_read_only(self.engine)
         _refuse_read_only(self.folder, self._captures)

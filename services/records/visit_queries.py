@@ -63,20 +63,20 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
         return patient, None if value is None else row_validation.text(value)
 
 
-def find_rows(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
+def find_rows(session: Session, limit: int, day: str | None, open: bool | None, number: str | None) -> list[VisitRow]:
     """Return the newest `limit` visit rows, newest first, that match all given filters.
 
     Of these, rows without an id are omitted: there may be fewer. The order is that of their begin (row number),
-    independent of the clock. `day`: date of the visit; `open`: True for unfinished, False for finished; `digits`: part
-    of the patient's number, also letters.
+    independent of the clock. `day`: date of the visit; `open`: True for unfinished, False for finished; `number`: part
+    of the patient's number.
     """
     query = select(VisitRow).order_by(VISIT_ROWID.desc()).limit(limit)
     if day is not None:
         query = query.where(VisitRow.day == day)
     if open is not None:
         query = query.where(VisitRow.finished_at.is_(None) if open else VisitRow.finished_at.is_not(None))
-    if digits:
-        query = query.where(func.instr(VisitRow.patient, digits.upper()) > 0)
+    if number:
+        query = query.where(func.instr(VisitRow.patient, number.upper()) > 0)
     return [row for row in session.scalars(query) if row is not None]
 
 
@@ -215,7 +215,7 @@ def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[obj
 def _taken_capture(capture: object, verdict_json: object, method: object, channels_json: object) -> SlotCapture:
     """Return a capture of a slot; ValueError for an id that is no text.
 
-    A verdict that is missing or unreadable is None; so is `no_colour` with a report that is.
+    The verdict is None if it is missing or unreadable; `no_colour` is None if the report is.
     """
     try:
         verdict = None if verdict_json is None else StoredVerdict.parse(verdict_json)

@@ -61,17 +61,17 @@ class VisitRepository:
             return visit_queries.read_visit(session, self.protocol, visit_queries.visit_row(session, id))
 
     def visits(
-        self, limit: int, day: str | None = None, open: bool | None = None, digits: str | None = None
+        self, limit: int, day: str | None = None, open: bool | None = None, number: str | None = None
     ) -> list[Visit]:
         """Return the newest visits, newest first, at most `limit`, without those that cannot be read.
 
-        `day`: date (ISO 8601) of the visit; `open`: True for unfinished, False for finished visits; `digits`: a part of
+        `day`: date (ISO 8601) of the visit; `open`: True for unfinished, False for finished visits; `number`: a part of
         the patient's number.
         """
-        digits = numbering.join_check_digit(digits.upper()) if digits else None
+        number = numbering.join_check_digit(number.upper()) if number else None
         with storage_errors(), Session(self._engine) as session:
             return visit_queries.read_visits(
-                session, self.protocol, visit_queries.find_rows(session, limit, day, open, digits)
+                session, self.protocol, visit_queries.find_rows(session, limit, day, open, number)
             )
 
     def damaged(self) -> int:
