@@ -1,4 +1,4 @@
-"""Security middlewares: CSRF and DNS rebinding (checks of Host, Origin, Sec-Fetch-Site), body limit, security headers.
+"""Security middlewares: CSRF and DNS rebinding (Host, Origin, Sec-Fetch-Site), body limit, HEAD, security headers.
 
 Changing requests with a foreign `Origin` are refused. `GET /api/preview` turns the lamp on, and a foreign page can send
 it with an <img>: it needs a same-origin `Sec-Fetch-Site` (browsers set it over https and on localhost), or, without

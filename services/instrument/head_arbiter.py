@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Condition
+from typing import Literal
 
 from device.calibration.archive import Archive
 from device.calibration.monitoring.finding import Finding
@@ -91,7 +92,7 @@ class HeadOwner:
         return self.exam.state if self.exam is not None else "busy"
 
     @property
-    def idle_state(self) -> str:
+    def idle_state(self) -> Literal["starting", "idle"]:
         """The calibration state without a run: `starting` until the exam can release the head, then `idle`."""
         return "idle" if self.exam is not None and self.exam.ready.is_set() else "starting"
 

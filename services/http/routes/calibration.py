@@ -175,7 +175,7 @@ def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
     )
 
 
-def _state_without_run(owner: HeadOwner) -> str:
+def _state_without_run(owner: HeadOwner) -> Literal["starting", "idle", "lenses"]:
     """Return the calibration state without a calibration run: `lenses` during a run with trial lenses, else idle."""
     return owner.idle_state if owner.session is None else "lenses"
 

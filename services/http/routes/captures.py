@@ -38,14 +38,15 @@ def press_router(
         restart of the server. Answers 201 with the capture once it is stored. Refused before it is accepted: 403 for a
         cross-origin request (CSRF), 404 for an unknown visit or slot, 409 while the camera is busy, without consent, in
         a finished visit, for a key of another request or while another screen holds the control lease, 422 for an
-        invalid body, 423 without a valid calibration. Failed after it: 409 if the consent was withdrawn, 423 if light,
-        heat or power forbid the exposure, 500 if the store is damaged, 503 if a part of the head does not answer or
-        the store is locked or read-only, 507 if the disk is full.
+        invalid body or a slot of the other eye, 423 without a valid calibration, 500 or 503 if the store cannot be
+        read. Failed after it: 409 if the consent was withdrawn or the server is stopping, 423 if light, heat or power
+        forbid the exposure, 500 if the store is damaged, 503 if a part of the head does not answer or the store is
+        locked or read-only, 507 if the disk is full.
         """
         key = press.key
         pictures = repository.pictures
         known_id = pictures.capture_for_key(key, press.eye, press.visit, press.slot) if key else None
-        if known_id is not None:  # answered before a restart of the server
+        if known_id is not None:  # stored already, perhaps before a restart of the server
             return capture_answer(store.get(known_id))
         target = pictures.capture_target(press.eye, key, press.visit, press.slot)
         future = exam().press(press.eye, key, target)

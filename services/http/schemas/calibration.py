@@ -127,15 +127,15 @@ class TrialLensAnswer(ResponseBody):
 class CalibrationAnswer(ResponseBody):
     """State of the calibration procedure, its errors, and the archived calibrations.
 
-    `state`: `starting`, `idle`, `begin`, `asking` (for the target `stand`) or `measuring`; `lenses` during a run with
-    trial lenses, which is described by `lenses`, as is the last run if it was one. `progress`: 0 to 1, or null.
-    `error`: last error of the procedure. `needed`: error because of which a calibration is required. `unfinished`:
-    targets whose measurement can be resumed. `made`: calibration of the last run; `kept`: the newest calibrations and
-    the one in force. `mishaps`: faults that can be injected into a simulated head. `white_dn`: counts of a saturated
-    pixel.
+    `state`: `starting`, `idle`, `begin`, `asking` (for the target `stand`) or `measuring`; `lenses` while a run with
+    trial lenses owns the head. `lenses`: that run, or the last one if it was with trial lenses; else null. `progress`:
+    0 to 1, or null. `error`: last error of the procedure. `needed`: error because of which a calibration is required.
+    `unfinished`: targets whose measurement can be resumed. `made`: calibration of the last run; `kept`: the newest
+    calibrations and the one in force. `mishaps`: faults that can be injected into a simulated head. `white_dn`: counts
+    of a saturated pixel.
     """
 
-    state: str
+    state: Literal["starting", "idle", "begin", "asking", "measuring", "lenses"]
     stand: CalibrationTarget | None
     progress: float | None
     error: ErrorText | None
