@@ -177,7 +177,7 @@ def reported_refractions(captures: Iterable[Capture]) -> list[ReportedRefraction
 def has_eye(capture: Capture) -> bool:
     """Return whether a capture shows an eye through its whole pupil, by the figures of its verdict; True without one.
 
-    The code of a last try is `shot.poor`, whatever the cause.
+    Its code does not show that: on the last try it is `shot.poor`, whatever the cause.
     """
     verdict = capture.report.verdict
     return verdict is None or shows_eye(verdict.numbers)

@@ -117,7 +117,7 @@ class IdempotencyKeys:
         return press.future
 
     def remember(self, press: Press) -> None:
-        """Store a press that has a key, in place of the one whose key was not used for longest beyond REMEMBERED."""
+        """Store a press that has a key; beyond REMEMBERED of them, forget the one whose key was unused for longest."""
         if press.key is not None:
             self._presses.put(press.key, press)
 

@@ -163,7 +163,7 @@ class CapturePipeline:
         """Return the exposure with its first good frame at the front, and the verdict on that frame.
 
         Without a good frame the order stays, and the verdict is that on the first one. Frames with another verdict than
-        the first one are marked as unusable.
+        the one then at the front are marked as unusable.
         """
         verdicts = [self._verdict(frame, exposure) for frame in exposure.lit]
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
@@ -185,7 +185,10 @@ class CapturePipeline:
         return self._feedback.assess(frame.counts, exposure.dark_counts, exposure.begin_s)
 
     def quick_look(self, shot: ExposedCapture) -> Image:
-        """Return the picture of the first stage, cropped to the illuminated field; FrameError for a useless frame."""
+        """Return the picture of the first stage, cropped to the illuminated field, made now unless it is prepared.
+
+        FrameError if the frame cannot be reconstructed.
+        """
         if (prepared := shot.exposure.prepared.get(0)) is not None:
             return prepared.look.picture
         made = self.reconstructor(shot.frame.counts, shot.exposure.dark_counts, quick=True)

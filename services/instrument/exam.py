@@ -38,9 +38,9 @@ class ExamService:
 
     Callable from any thread. The thread `head`, started here, owns the head until `close`; a press before `ready` waits
     until the FFT plans are made, a request for a live picture 2 s. After an error during planning, a LightFault of the
-    lamp's `off` or an unexpected exception, `on_failure` is called. `budget_s` returns the time budget of a capture,
-    `plans` is the folder of the FFT plans. `resumed_target` returns the target of a capture that a kill has
-    interrupted, whose frames are reconstructed first (resumption.py).
+    lamp's `off` or an unexpected exception, `on_failure` is called, but not while the exam closes. `budget_s`
+    returns the time budget of a capture, `plans` is the folder of the FFT plans. `resumed_target` returns the target of
+    a capture that a kill has interrupted, whose frames are reconstructed first (resumption.py).
     """
 
     def __init__(
@@ -101,7 +101,10 @@ class ExamService:
 
     @property
     def problem(self) -> DiffuscopeError | None:
-        """The error of the last live picture, or the one that ended the exam; None if there is none."""
+        """The error of the last live picture, StoreLocked for which a capture waits, or the one that ended the exam.
+
+        None if there is none.
+        """
         return self.snapshot.output.problem
 
     @property

@@ -109,7 +109,7 @@ class ExamEvents:
             self._event_bus.publish("failed", code=error.code, message=error.message, remedy=error.remedy)
 
     def ended(self, problem: DiffuscopeError | None, failure: DiffuscopeError | None) -> None:
-        """Show the error that ended the exam, None if it was closed; `failure`: see `ExamOutput`."""
+        """Show the error that ended the exam, after a close (None) the one before; `failure`: see `ExamOutput`."""
         self._requests.show(replace(self.output, problem=problem or self.output.problem, failure=failure))
 
     def _show_quick_looks(self, quick_looks: dict[str, bytes]) -> None:

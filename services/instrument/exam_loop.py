@@ -128,7 +128,9 @@ class ExamLoop:
         return presses
 
     def _expose_pending(self) -> None:
-        """Expose the waiting press, dark and lit, publish its first verdict and queue the exposure for reconstruction.
+        """Expose the waiting press, publish its first verdict and queue the exposure for its reconstruction.
+
+        The frames are dark, lit, and in other colours.
 
         Consent and space are checked and a journal entry is written before the light; an error fails the press.
         """
@@ -217,9 +219,9 @@ class ExamLoop:
     def _resolving(self, press: Press, id: str, on_error: ExamEvent) -> Iterator[None]:
         """Turn the lamp off at exit; on an error, apply the event `on_error` to the state and fail the press's future.
 
-        A DiffuscopeError is also published on the event bus. Journal entry and frames stay, so that the next start
-        resumes the capture, after a refusal of the store that may end, and after an exception of another kind, which
-        is raised again. LightFault if the lamp cannot be turned off.
+        A DiffuscopeError is also published on the event bus, and ends the journal entry. Entry and frames stay, so that
+        the next start resumes the capture, after a refusal of the store that may end, if a lit frame is on the disk,
+        and after an exception of another kind, which is raised again. LightFault if the lamp cannot be turned off.
         """
         try:
             yield
@@ -246,7 +248,7 @@ class ExamLoop:
             shot.verdict.word,
             shot.verdict.code,
         ):
-            self._events.verdict(shot.id, verdict)  # a failed reconstruction is published with the stored capture
+            self._events.verdict(shot.id, verdict)  # `make.failed` is shown with the stored capture
         capture, files_of = self._pipeline.record(shot, made, verdict, budget_s)
         self._events.stage(shot.press, shot.id, "keep")
         target = shot.press.target
@@ -297,7 +299,7 @@ class ExamLoop:
     def _expose_during_refinement(self) -> None:
         """Expose the waiting press and publish its quick look while the running refinement is suspended.
 
-        The exposure stays queued for its own reconstruction.
+        The exposure stays queued for its own reconstruction, unless it or its quick look has failed.
         """
         self._expose_pending()
         if self._exposed:
@@ -361,7 +363,7 @@ def run_exam(
     """Make the plans, call `ready`, then run the loop; at every exit turn the lamp off and fail the waiting presses.
 
     After a planning error, a LightFault of the lamp's `off` or an unexpected exception also call `on_failure`, which
-    ends the process (restart).
+    ends the process (restart), unless the exam is being closed.
     """
     failure: DiffuscopeError | None = None
     loop: ExamLoop | None = None

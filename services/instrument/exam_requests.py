@@ -25,9 +25,10 @@ WANTED_S = 3.0  # the live pictures continue this long after the last request, t
 class ExamOutput:
     """What the thread `head` shows to other threads.
 
-    `preview`: latest live picture (number 0 before the first). `problem`: error of the last live picture, or the one
-    that ended the exam. `failure`: the latter, if it is a reported error (of the planning, or LightFault of a lamp that
-    cannot be turned off) and no unexpected exception. `quick_looks`: JPEG by id of a capture in progress.
+    `preview`: latest live picture (number 0 before the first). `problem`: error of the last live picture, the
+    StoreLocked for which a capture waits, or the one that ended the exam. `failure`: the last of these, if it
+    is a reported error (of the planning, or LightFault of a lamp that cannot be turned off), no unexpected exception.
+    `quick_looks`: JPEG by id of a capture in progress.
     """
 
     preview: Preview = NO_PREVIEW

@@ -44,7 +44,8 @@ class FrameAssessor:
     def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
         """Return the verdict on the raw frame of a capture before its reconstruction.
 
-        `dark`: its dark frame; None: that of the calibration, for the brightness the black level of the sensor.
+        `dark`: its dark frame; without it (None) that of the calibration is subtracted, and for the brightness the
+        black level of the sensor.
         `begin_s`: begin of the exposure (clock seconds).
         FAILED_VERDICT for a frame that cannot be assessed.
         """
@@ -57,7 +58,7 @@ class FrameAssessor:
     def reassess(self, first: Verdict, report: Report, target: CaptureTarget) -> Verdict:
         """Return the final verdict after reconstruction.
 
-        A failed reconstruction of a good frame gives FAILED_VERDICT, a bad verdict after too many tries `shot.poor`.
+        A failed reconstruction of a good frame gives FAILED_VERDICT; on the last try each bad verdict is `shot.poor`.
         """
         if report.method == NO_METHOD and first.code is None:
             first = FAILED_VERDICT

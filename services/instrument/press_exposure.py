@@ -80,7 +80,7 @@ def expose_press(
     taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
     split: ExposureSplit = WHOLE,
 ) -> Exposure:
-    """Return a dark frame, up to `count` lit ones, and one in each of `colours`; they are exposed in this order.
+    """Return a dark frame, the frames of up to `count` lit exposures, and one in each of `colours`, in this order.
 
     With a `split` each of the `count` exposures is split into so many frames of equal length, without more light; the
     dark frame is as long as a part, those in other colours are whole. The dose counts for `eyes`, without a visit
@@ -90,7 +90,8 @@ def expose_press(
     on.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not or
-    cannot be on. The lamp is off at every exit.
+    cannot be on, LightCut if the guard has ended the first lit frame, CameraMissing or CameraStalled if the camera
+    fails before the last lit one. The lamp is off at every exit.
     """
     head.check()
     run = _Exposing(head, eyes, clock, in_visit, taken)
