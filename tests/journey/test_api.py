@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from io import BytesIO
-from threading import Event
+from threading import Event, Thread, current_thread
 from typing import Any
 
 import httpx
 import pytest
 from PIL import Image
+from sqlalchemy import event
 
 from device.errors import DiffuscopeError
 from services.http.problem_responses import HTTP_STATUS, problem_response
@@ -83,6 +84,26 @@ def test_each_error_class_has_its_status_code_and_remedy() -> None:
         assert 400 <= answer.status_code < 600
     assert len({leaf.code for leaf in ours}) == len(ours)
     assert DiffuscopeError in HTTP_STATUS  # fallback for new classes
+
+
+def test_a_press_reads_the_database_beside_the_event_loop(old_rig: Any) -> None:
+    """A slow disk must not delay the answers to the other requests."""
+    readers = set[Thread]()
+
+    def note(*_: object) -> None:
+        readers.add(current_thread())
+
+    async def scenario(client: httpx.AsyncClient) -> Thread:
+        assert (await client.post("/api/captures", json=OD | {"key": "0123456789abcdef"})).status_code == 201
+        return current_thread()
+
+    event.listen(old_rig.store.engine, "before_cursor_execute", note)
+    try:
+        loop = old_rig.ask(scenario)
+    finally:
+        event.remove(old_rig.store.engine, "before_cursor_execute", note)
+    assert readers
+    assert loop not in readers
 
 
 def test_capture_request_answers_201_with_working_links(old_rig: Any) -> None:

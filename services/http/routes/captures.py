@@ -6,6 +6,7 @@ from pathlib import Path
 
 from fastapi import APIRouter, Query, Response
 from fastapi import Path as InPath
+from fastapi.concurrency import run_in_threadpool
 
 from services.errors import RecordNotFound
 from services.http.media import file_responses
@@ -13,7 +14,9 @@ from services.http.schemas.captures import CaptureAnswer, CaptureList, NewCaptur
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import HeadArbiter
 from services.instrument.pending_captures import PendingCaptures
+from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
+from services.records.capture_target import CaptureTarget
 from services.records.visit_repository import VisitRepository
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tiff": "image/tiff", ".json": "application/json"}
@@ -28,6 +31,15 @@ def press_router(
     the request which finishes their visit waits for.
     """
     router = APIRouter()
+    pictures = repository.pictures
+
+    def stored_or_target(press: NewCapture) -> Capture | CaptureTarget:
+        """Return the capture that a repeated request has stored, perhaps before a restart, else its target."""
+        key = press.key
+        known_id = pictures.capture_for_key(key, press.eye, press.visit, press.slot) if key else None
+        if known_id is not None:
+            return store.get(known_id)
+        return pictures.capture_target(press.eye, key, press.visit, press.slot)
 
     @router.post("/api/captures", status_code=201)
     async def create_capture(press: NewCapture) -> CaptureAnswer:
@@ -43,13 +55,10 @@ def press_router(
         forbid the exposure, 500 if the store is damaged, 503 if a part of the head does not answer or the store is
         locked or read-only, 507 if the disk is full.
         """
-        key = press.key
-        pictures = repository.pictures
-        known_id = pictures.capture_for_key(key, press.eye, press.visit, press.slot) if key else None
-        if known_id is not None:  # stored already, perhaps before a restart of the server
-            return capture_answer(store.get(known_id))
-        target = pictures.capture_target(press.eye, key, press.visit, press.slot)
-        future = exam().press(press.eye, key, target)
+        found = await run_in_threadpool(stored_or_target, press)  # reads the database
+        if isinstance(found, Capture):
+            return capture_answer(found)
+        future = exam().press(press.eye, press.key, found)
         if press.visit is not None:
             pending.add(press.visit, future)
         return capture_answer(await asyncio.wrap_future(future))
