@@ -124,8 +124,8 @@ class BurstReconstructor:
         """Yield the quick look of the first frame, RoundDone after frames and rounds, and the picture of the burst.
 
         Each frame that is not prepared and each round is followed by RoundDone. The deadline moves by the time until
-        the consumer continues after it. A burst of one usable frame
-        gives the picture of that frame; a deadline that leaves no time to join them gives that of the first.
+        the consumer continues after it. A burst of one usable frame gives the picture of that frame; a deadline that
+        leaves no time to join them, and to solve the joined frame with one round, gives that of the first.
 
         Parameters
         ----------
@@ -164,7 +164,7 @@ class BurstReconstructor:
             )
             return
         saturated = yield from self._quick_look(frames[0], dark, ready.get(0), simulated)
-        if not run.fits(self._cost_s(frames, ready, unusable)):
+        if not run.fits(self._cost_s(frames, ready, unusable) + self.single.stages[-1].least_s):
             self.see_cost.halve_maximum()
             self.join_cost.halve_maximum()
             reasons = unusable or {}

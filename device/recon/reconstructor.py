@@ -185,6 +185,11 @@ class _Stage:
         """Last solution: (rows, cols) or (rows, cols, 3) of the grid."""
         return self.planes[0] if len(self.planes) == 1 else np.moveaxis(self.planes, 0, -1)
 
+    @property
+    def least_s(self) -> float:
+        """Estimated minimum duration for one channel, seconds: start, one round and finish."""
+        return self.start_cost.seconds + self.round_cost.seconds + self.finish_cost.seconds
+
     def halve_costs(self) -> None:
         """Halve the cost estimates after the stage was skipped; one slow run would otherwise block it forever."""
         for cost in (self.start_cost, self.round_cost, self.finish_cost):
@@ -479,14 +484,16 @@ class Reconstructor:
     ) -> RefractionTask | None:
         """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
 
-        `task`: that of the frame, if it has begun; `others`: the other frames of its burst, which are joined without
-        a deadline only. Return the task, None without a refractor; without time `task` as it is.
+        `task`: that of the frame, if it has begun: once it has found the refraction, the estimate takes no time.
+        `others`: the other frames of its burst, which are joined without a deadline only. Return the task, None without
+        a refractor; without time `task` as it is.
         """
         begin_s = self.clock.now_s()
         eye = None
         if self.refractor is None:
             return None
-        cost_s = self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
+        find_s = 0.0 if task is not None and task.has_found else self._find_cost.seconds
+        cost_s = find_s + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
         if run.fits(cost_s):
             with_cylinder = run.fits(cost_s + self._cylinder_s)
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
@@ -498,6 +505,8 @@ class Reconstructor:
             self._take_cylinder(run, task, wait=run.deadline is None)
             best = run.refraction if isinstance(run.refraction, Refraction) else task.best()
             eye = best.psf_wavefront if isinstance(best, Refraction) else None
+        else:
+            self._refocus_cost.halve_maximum()
         self._refocus(eye)
         run.refraction_s = self.clock.now_s() - begin_s - run.cylinder_s
         return task
@@ -654,7 +663,7 @@ class _Run:
 
     def cost_s(self, stage: _Stage) -> float:
         """Return the minimum duration of a stage in seconds: start, one round and finish, for all channels."""
-        return self.channels * (stage.start_cost.seconds + stage.round_cost.seconds) + stage.finish_cost.seconds
+        return self.channels * stage.least_s - (self.channels - 1) * stage.finish_cost.seconds
 
     def brightest(self) -> ChannelFrame:
         """Return counts, dark frame and defective pixels of the channel with the highest mean count."""

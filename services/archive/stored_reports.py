@@ -26,5 +26,5 @@ def earlier_figures(path: str) -> dict[str, object]:
         "before_verdict": verdict and verdict.word,
         "before_cause": verdict and verdict.code,
         "dose_j_per_cm2": report.dose_j_per_cm2,
-        "before_seconds": report.total_s or None,
+        "before_seconds": report.from_read_out_s,
     }

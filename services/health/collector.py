@@ -1,6 +1,7 @@
 """Status collector: the inputs of the health checks from instrument, capture store, upload queue and computer."""
 
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -10,7 +11,7 @@ from device.errors import StoreError
 from device.light_safety.hazard import light_limits
 from services.backup.backup_key import read_key
 from services.errors import BackupDamaged, RecordRemoved
-from services.health.checks import StatusSnapshot
+from services.health.checks import PressTimes, StatusSnapshot
 from services.health.clock_source import clock_state
 from services.health.instrument_status import InstrumentStatus
 from services.records.capture import Capture
@@ -49,11 +50,7 @@ def collect_status(
         now=clock.wall(),
         clock=clock_state(),
         newest=newest[0].taken_at if newest else None,
-        presses=[
-            (spent_s, spent_s - capture.report.budget_s)
-            for capture in newest
-            if (spent_s := capture.report.total_s) > 0
-        ],
+        presses=_press_times(newest),
         unsent=unsent,
         torn_bytes=list(store.quarantine.sizes_bytes().values()),
         orphans=orphans,
@@ -67,6 +64,16 @@ def collect_status(
         throttled_bits=read_throttled_bits(PLATFORM_DEVICES),
         lacks_files=store.space.lacks_files(),
     )
+
+
+def _press_times(captures: Sequence[Capture]) -> list[PressTimes]:
+    """Return the times of captures whose tap and read-out were in one run."""
+    reports = [capture.report for capture in captures]
+    return [
+        PressTimes(report.from_read_out_s, report.from_tap_s, report.budget_s)
+        for report in reports
+        if report.from_read_out_s is not None and report.from_tap_s is not None
+    ]
 
 
 def read_throttled_bits(devices: Path) -> int | None:

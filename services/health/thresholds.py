@@ -11,7 +11,8 @@ from device.config.operating_limits import is_too_hot
 
 MIN_VISITS_LEFT = 10  # visits of a morning, both eyes each
 MAX_SHOWN_VISITS = 200  # larger numbers are not shown, on the page neither: they change with every picture
-MAX_LATENESS_S = 1.0  # margin beyond the time budget: exposure and storage
+MAX_LATENESS_S = 1.0  # margin beyond the time budget: above it the instrument is too slow
+MAX_OVERRUN = 0.05  # share of the time budget: above it a picture has missed its deadline
 MAX_COMPUTER_C = 80.0  # a Raspberry Pi reduces its clock above this
 WARM_MARGIN_C = 5.0  # margin below the limit of the head at which it counts as warm
 COOLING_S = 300.0  # the text of the alert says five minutes
@@ -34,6 +35,11 @@ def are_many_visits(visits: int) -> bool:
 def is_late(lateness_s: float) -> bool:
     """Return whether a capture exceeds its time budget by more than MAX_LATENESS_S."""
     return lateness_s > MAX_LATENESS_S
+
+
+def misses_deadline(took_s: float, budget_s: float) -> bool:
+    """Return whether a picture was made later than its time budget by more than MAX_OVERRUN of it."""
+    return took_s > (1 + MAX_OVERRUN) * budget_s
 
 
 def is_warm(head_c: float, limit_c: float) -> bool:

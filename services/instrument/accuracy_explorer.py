@@ -1,7 +1,7 @@
 """Accuracy against computing time on this device: measurement, new reconstruction of captures, time budget.
 
     FOLDER/frontier.json    the last measurement (services/research/frontier.py)
-    FOLDER/choice.json      the selected time budget: quick, standard or best
+    FOLDER/choice.json      the selected time budget: grey, quick or standard
 
 The module does not use the head: it simulates a scene with the same camera, and it reads stored captures.
 """

@@ -17,7 +17,7 @@ from services.imaging.raw_metadata import RawMetadata
 from services.instrument.press_exposure import Exposure
 from services.lru_cache import LruCache
 from services.records.blobs import FileContent, WrittenFile
-from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, StoredVerdict
+from services.records.capture import BUDGET_S, COLOUR, Capture, CaptureReport, LateralityEstimate, StoredVerdict
 from services.records.capture_journal import InterruptedCapture
 from services.records.capture_target import CaptureTarget, Permit, permit_test_picture
 from services.records.frame_writer import DARK, FIRST
@@ -55,12 +55,16 @@ NO_VISIT = LiveRequest()
 
 @dataclass(frozen=True)
 class Press:
-    """Accepted capture request: future of the capture, eye, capture target and idempotency key."""
+    """Accepted capture request: future of the capture, eye, capture target, idempotency key and time of its arrival.
+
+    `tapped_s` is in clock seconds, None for a press of an earlier run.
+    """
 
     future: Future[Capture]
     eye: Eye
     target: CaptureTarget
     key: str | None
+    tapped_s: float | None = None
 
     def journal_entry(self, id: str) -> InterruptedCapture:
         """Return the journal entry that is written before the exposure; `id` is the identifier of the capture."""
@@ -72,7 +76,7 @@ class ExposedCapture:
     """Capture before its reconstruction: the press, its exposure with the first verdict, on `frame`, and dose report.
 
     `written` waits for the frames that are being written to the disk, and returns their files by the number of the
-    frame. `notes`: warnings on the exposure for the report.
+    frame. `notes`: warnings on the exposure for the report. `budget_s`: time budget (time_budget.py).
     """
 
     press: Press
@@ -83,6 +87,7 @@ class ExposedCapture:
     verdict: Verdict
     written: Callable[[], Mapping[int, WrittenFile]] = dict
     notes: tuple[str, ...] = ()
+    budget_s: float = BUDGET_S
 
     @property
     def frame(self) -> Frame:
@@ -185,13 +190,14 @@ def _frame_files(capture: Capture, head: str, shot: ExposedCapture) -> dict[str,
 
 
 def capture_report(
-    shot: ExposedCapture, made: Report, verdict: Verdict, seen: Laterality | None, budget_s: float
+    shot: ExposedCapture, made: Report, verdict: Verdict, seen: Laterality | None, made_s: float
 ) -> CaptureReport:
     """Return the report of a capture, with plain numbers for numpy scalars.
 
-    `made`: report of the reconstruction; `verdict`: the final one; `seen`: laterality of the picture; `budget_s`: time
-    budget in seconds.
+    `made`: report of the reconstruction; `verdict`: the final one; `seen`: laterality of the picture; `made_s`: clock
+    seconds at which the picture was made.
     """
+    tapped_s = shot.press.tapped_s
     entries = vars(made) | vars(shot.light)
     entries |= {
         "seconds": {"expose": shot.exposure.duration_s, **made.seconds},
@@ -203,6 +209,8 @@ def capture_report(
         slot=shot.press.target.slot,
         verdict=StoredVerdict(**vars(verdict)),
         laterality=None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),
-        budget_s=budget_s,
+        budget_s=shot.budget_s,
+        from_read_out_s=round(made_s - shot.exposure.read_out_s, 4),
+        from_tap_s=None if tapped_s is None else round(made_s - tapped_s, 4),
     )
     return CaptureReport.read(report.as_json())

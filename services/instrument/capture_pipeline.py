@@ -92,13 +92,15 @@ class CapturePipeline:
         split: ExposureSplit = WHOLE,
         colours: Sequence[Colour] = (),
         field: str | None = None,
+        refract: bool = True,
         taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
         looked: Looked = lambda picture, simulated: None,
     ) -> Exposure:
         """Return a dark frame, up to `exposures(count)` lit ones and one in each of `colours`, as `expose_press`.
 
         A pipeline of bursts prepares each lit frame while the next one is exposed, and splits the exposures as `split`
-        says. `looked` is called in the thread of the preparation, with the quick look of the first useful frame.
+        says. `looked` is called in the thread of the preparation, with the quick look of the first useful frame, whose
+        refraction is estimated meanwhile with `refract`.
         """
         able = [] if self.colours is None else [other for other in colours if other in self.colours.others]
         run = partial(
@@ -116,7 +118,7 @@ class CapturePipeline:
         else:
             colour = self._head.spec.light.colour
             begin_s = self._clock.now_s()
-            with FramePreparation(self._feedback, self.bursts, colour, begin_s, looked) as preparation:
+            with FramePreparation(self._feedback, self.bursts, colour, begin_s, looked, refract) as preparation:
 
                 def read_out(frame: Frame, dose_j_per_cm2: float, exposed_s: float) -> None:
                     taken(frame, dose_j_per_cm2, exposed_s)
@@ -194,12 +196,13 @@ class CapturePipeline:
         made = self.reconstructor(shot.frame.counts, shot.exposure.dark_counts, quick=True)
         return crop_to_field(made.picture, self._head)
 
-    def reconstruct(self, shot: ExposedCapture, budget_s: float) -> Iterator[Step]:
-        """Yield the steps of the reconstruction within `budget_s` seconds; the last one is the picture.
+    def reconstruct(self, shot: ExposedCapture, free_s: float = 0.0) -> Iterator[Step]:
+        """Yield the steps of the reconstruction within the time budget (time_budget.py); the last one is the picture.
 
-        After a FrameError it is the raw frame, with the error in its report: the exposure has cost dose.
+        `free_s`: clock seconds at which the instrument was done with other presses. After a FrameError it is the raw
+        frame, with the error in its report: the exposure has cost dose.
         """
-        deadline = Deadline.after(self._clock, budget_s)
+        deadline = Deadline(self._clock, max(shot.exposure.read_out_s, free_s) + shot.budget_s)
         try:
             yield from self._steps(shot, deadline)
         except FrameError as error:
@@ -245,15 +248,16 @@ class CapturePipeline:
         return self._feedback.reassess(shot.verdict, report, shot.press.target)
 
     def record(
-        self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, budget_s: float
+        self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, made_s: float
     ) -> tuple[Capture, Callable[[], dict[str, FileContent]]]:
         """Return a capture with its report and laterality estimate, and a function that returns its files by name.
 
-        That function waits until the frames of the press are on the disk, or have failed to be.
+        That function waits until the frames of the press are on the disk, or have failed to be. `made_s`: clock seconds
+        at which the picture was made.
         """
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
-        report = replace(capture_report(shot, made.report, verdict, side, budget_s), device=self._origin())
+        report = replace(capture_report(shot, made.report, verdict, side, made_s), device=self._origin())
         calibration_id = self._head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, report, {})
         colour = made.colour if isinstance(made, ColourReconstruction) else None

@@ -58,6 +58,7 @@ class ExamService:
         self.head = head
         self.store = store
         self.ready = Event()
+        self._clock = clock
         self._requests = requests = ExamRequests(clock)
         self.progress = Progress(clock, (FRAMES + 1) * head.spec.camera.exposure_s, budget_s)
         self.capture_journal = CaptureJournal(store)
@@ -121,7 +122,9 @@ class ExamService:
         """
         future: Future[Capture] = Future()
         future.set_running_or_notify_cancel()  # a client that disconnects cannot cancel the capture
-        return self._requests.press(Press(future, eye, target, key), self.calibration_monitor.refusal())
+        return self._requests.press(
+            Press(future, eye, target, key, self._clock.now_s()), self.calibration_monitor.refusal()
+        )
 
     async def preview(self, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
         """Return the next live picture with a number above `after`; None after `wait_s` seconds or at close.

@@ -34,6 +34,7 @@ from services.instrument.live_pictures import LivePictures
 from services.instrument.press_exposure import Exposure, colours_of_lamp
 from services.instrument.resumption import ResumedPress, resumed_frames
 from services.instrument.shutter_button import ShutterButton
+from services.instrument.time_budget import is_of_one_frame, within_budget
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
@@ -53,7 +54,7 @@ POSTPONED = "The frames of this picture are kept: the picture is made at the nex
 class ExamParts:
     """Parts of an exam that its service and its loop share.
 
-    `budget_s` returns the time budget of a reconstruction. `resumed`: presses of the run before, whose frames are on
+    `budget_s` returns the time budget of a picture. `resumed`: presses of the run before, whose frames are on
     the disk.
     """
 
@@ -93,6 +94,7 @@ class ExamLoop:
         self._exposed: deque[ExposedCapture] = deque()
         self._resumed = deque(parts.resumed)
         self._last_update_s = 0.0
+        self._free_s = 0.0  # clock seconds at which the last work on another press had ended
 
     def run(self) -> None:
         """Run actions until the exam closes and every exposed capture is stored."""
@@ -134,6 +136,7 @@ class ExamLoop:
 
         Consent and space are checked and a journal entry is written before the light; an error fails the press.
         """
+        is_first = not self._exposed
         press = self._requests.take_press()
         self._events.state()
         taken_at = self._parts.clock.wall()
@@ -143,11 +146,14 @@ class ExamLoop:
             # Before the `off` at the exit of this context: if that fails during a refinement, this capture is exposed
             # and waits all the same, and the error fails only the capture whose refinement is suspended.
             self._requests.advance(ExamEvent.EXPOSED)
+        if not is_first:
+            self._free_s = self._parts.clock.now_s()
         self._events.state()
 
     def _take(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
         head = self._parts.head
-        target = press.target
+        budget_s = self._parts.budget_s()
+        target = within_budget(press.target, budget_s)
         target.permit()  # again: the consent may have been withdrawn while the press waited
         self._parts.store.refuse_light_in_vain()
         entry = press.journal_entry(id)
@@ -164,10 +170,11 @@ class ExamLoop:
             split=split,
             colours=colours,
             field=target.field,
+            refract=not is_of_one_frame(budget_s),
             taken=FrameSink(writer, shared, head.spec.light.colour),
             looked=partial(self._events.quick_look, press, id, is_exposing=True),
         )
-        return replace(self._assessed(press, id, taken_at, exposure), written=writer.finish)
+        return replace(self._assessed(press, id, taken_at, exposure), written=writer.finish, budget_s=budget_s)
 
     def _assessed(self, press: Press, id: str, taken_at: datetime, exposure: Exposure) -> ExposedCapture:
         """Return the exposed capture with its first verdict, and publish the verdict."""
@@ -201,7 +208,7 @@ class ExamLoop:
         frames = resumed_frames(resumed.stored, self._parts.head.calibration, self._parts.clock.now_s())
         exposure = self._pipeline.resume(frames.exposure, press.target.colours)
         shot = self._assessed(press, id, frames.taken_at, exposure)
-        return replace(shot, written=lambda: resumed.files, notes=frames.notes)
+        return replace(shot, written=lambda: resumed.files, notes=frames.notes, budget_s=self._parts.budget_s())
 
     def _complete_oldest(self) -> None:
         """Reconstruct and store the oldest exposure, then resolve the future of its press."""
@@ -213,6 +220,7 @@ class ExamLoop:
             self._requests.advance(ExamEvent.STORED)
             self._events.state()
             shot.press.future.set_result(kept)
+        self._free_s = self._parts.clock.now_s()
         self._events.forget_quick_look(shot.id)
 
     @contextmanager
@@ -241,15 +249,15 @@ class ExamLoop:
 
     def _process(self, shot: ExposedCapture) -> Capture:
         """Reconstruct, assess and store one exposure; return the stored capture."""
-        budget_s = self._parts.budget_s()
-        made = self._reconstruct(shot, budget_s)
+        made = self._reconstruct(shot)
+        made_s = self._parts.clock.now_s()
         verdict = self._pipeline.reassess(shot, made.report)
         if verdict.code != FAILED_VERDICT.code and (verdict.word, verdict.code) != (
             shot.verdict.word,
             shot.verdict.code,
         ):
             self._events.verdict(shot.id, verdict)  # `make.failed` is shown with the stored capture
-        capture, files_of = self._pipeline.record(shot, made, verdict, budget_s)
+        capture, files_of = self._pipeline.record(shot, made, verdict, made_s)
         self._events.stage(shot.press, shot.id, "keep")
         target = shot.press.target
         files = files_of()
@@ -261,16 +269,16 @@ class ExamLoop:
             self._events.problem,
         )
         self._events.kept(shot.id)
-        took_s = kept.report.total_s
-        method = made.report.method
-        log.info("a picture was kept after %.1f s, made by %s", took_s, method, extra={"about": shot.id})
+        took_s = made_s - shot.exposure.read_out_s
+        text = "a picture was made in %.2f of %g s by %s"
+        log.info(text, took_s, shot.budget_s, made.report.method, extra={"about": shot.id})
         self._parts.calibration_monitor.add(kept)
         return kept
 
-    def _reconstruct(self, shot: ExposedCapture, budget_s: float) -> Reconstruction:
+    def _reconstruct(self, shot: ExposedCapture) -> Reconstruction:
         """Run the steps of a reconstruction; publish its quick look, and serve requests between its rounds."""
         self._last_update_s = self._parts.clock.now_s()
-        for step in self._pipeline.reconstruct(shot, budget_s):
+        for step in self._pipeline.reconstruct(shot, self._free_s):
             match step:
                 case StageResult(last=False):
                     self._events.quick_look(shot.press, shot.id, step.picture, shot.frame.simulated)

@@ -27,19 +27,27 @@ class FramePreparation:
 
     The thread of the press calls the methods. Until `finish` it must not use `assessor`, `bursts` and what `looked`
     uses: the thread of the preparation does. Only frames in the light of the burst, `colour`, are prepared. `begin_s`:
-    begin of the press (clock seconds). `looked` is called once, with the quick look of the first useful frame.
+    begin of the press (clock seconds). `looked` is called once, with the quick look of the first useful frame, whose
+    refraction is estimated with `refract`.
 
     A prepared frame holds 5 bytes per pixel: 8 frames of 2 MP, the most of a press, take 83 MB.
     """
 
     def __init__(
-        self, assessor: FrameAssessor, bursts: BurstReconstructor, colour: Colour, begin_s: float, looked: Looked
+        self,
+        assessor: FrameAssessor,
+        bursts: BurstReconstructor,
+        colour: Colour,
+        begin_s: float,
+        looked: Looked,
+        refract: bool = True,
     ) -> None:
         self._assessor = assessor
         self._bursts = bursts
         self._colour = colour
         self._begin_s = begin_s
         self._looked: Looked | None = looked
+        self._refract = refract
         self._executor = ThreadPoolExecutor(1, "preparation")
         self._dark: Counts | None = None
         self._ready: dict[int, Future[AssessedFrame]] = {}
@@ -66,7 +74,8 @@ class FramePreparation:
     def _prepare(self, frame: Frame) -> AssessedFrame:
         prepared = None
         with suppress(FrameError):  # its verdict says why
-            prepared = self._bursts.prepare(frame.counts, self._dark, refract=self._looked is not None)
+            refract = self._refract and self._looked is not None
+            prepared = self._bursts.prepare(frame.counts, self._dark, refract=refract)
         if prepared is not None and self._looked is not None:
             self._looked(prepared.look.picture, frame.simulated)
             self._looked = None

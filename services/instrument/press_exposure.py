@@ -48,6 +48,11 @@ class Exposure:
     ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
 
     @property
+    def read_out_s(self) -> float:
+        """Clock seconds of the last read-out; of an interrupted press, of the loading of its frames."""
+        return self.begin_s + self.duration_s
+
+    @property
     def dark_counts(self) -> Counts | None:
         """The counts of the dark frame; None, for that of the calibration, without one."""
         return None if self.dark is None else self.dark.counts

@@ -39,7 +39,7 @@ class Progress:
         self._took_s: dict[str, deque[float]] = {stage: deque(maxlen=RECENT) for stage in STAGES}
         self._reached_s: dict[str, dict[str, float]] = {}  # by capture and stage
         self._due_s: dict[str, float] = {}
-        self._oldest_s: float | None = None  # begin of the oldest capture in progress, for other threads
+        self._oldest_s: float | None = None  # quick look of the oldest capture in progress, for other threads
 
     def enter_stage(self, id: str, stage: str) -> ProgressEstimate:
         """Record that capture `id` has reached a stage (key of STAGES); return its progress there."""
@@ -70,12 +70,13 @@ class Progress:
 
     @property
     def late_s(self) -> float:
-        """Seconds by which the time since the oldest capture in progress began exceeds the time budget; 0.0 if none."""
+        """Seconds by which the time since the first quick look in progress exceeds the time budget; 0.0 if none."""
         oldest_s = self._oldest_s
         return 0.0 if oldest_s is None else max(0.0, self._clock.now_s() - oldest_s - self._at_most_s())
 
     def _update_oldest(self) -> None:
-        self._oldest_s = min((min(stages.values()) for stages in self._reached_s.values()), default=None)
+        looked_s = (stages["quick"] for stages in self._reached_s.values() if "quick" in stages)
+        self._oldest_s = min(looked_s, default=None)
 
     def _left_s(self, id: str, stage: str, now_s: float) -> float:
         """Return the estimated seconds until storage; except at stage `keep`, the other captures are stored first."""

@@ -102,7 +102,7 @@ def resumed_frames(stored: ResumableCapture, calibration: Calibration, now_s: fl
         if not stored_frame.is_lit and frame.illumination is not None
     }
     last = stored.frames[-1]
-    exposure = Exposure(lit, colours, dark, now_s, last.exposed_s, last.dose_j_per_cm2)
+    exposure = Exposure(lit, colours, dark, now_s - last.exposed_s, last.exposed_s, last.dose_j_per_cm2)
     return ResumedFrames(exposure, taken_at, _notes(stored, exposure, calibration, loaded[0][2].calibration_id))
 
 

@@ -15,7 +15,7 @@ from services.records.stored_record import CONFIG, StoredRecord
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
 COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
 OtherColour = Literal["red", "blue", "amber"]  # of light, besides the green one of the picture
-BUDGET_S = 5.0  # standard time budget, also of a report without one
+BUDGET_S = 5.0  # standard time budget, also of a report without one; defined in services/instrument/time_budget.py
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -170,7 +170,13 @@ class ShownReport(StoredRecord, DoseReport, Report):
     """Estimate of the eye that the picture shows."""
 
     budget_s: Number = BUDGET_S
-    """Time budget of the reconstruction in s."""
+    """Time budget of the picture in s, from the last read-out."""
+
+    from_read_out_s: Number | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Seconds from the last read-out (of a resumed press, from the loaded frames) to the final picture."""
+
+    from_tap_s: Number | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Seconds from the arrival of the request to the final picture; only if the picture is of the same run."""
 
     moved: tuple[EyeCorrection, ...] = dataclasses.field(default=(), metadata=OMITTED_IF_EMPTY)
     """Corrections of the eye, oldest first; only if there are any."""
@@ -183,11 +189,6 @@ class ShownReport(StoredRecord, DoseReport, Report):
     def test(self) -> bool:
         """True for a test picture, which belongs to no visit."""
         return self.visit is None
-
-    @property
-    def total_s(self) -> float:
-        """Return the sum of the durations of all stages in s; 0 without any."""
-        return float(sum(self.seconds.values()))
 
     @field_validator("seconds", "dose_24h_j_per_cm2", "refraction_scatter", mode="before")
     @classmethod

@@ -113,7 +113,8 @@ class CaptureReconstruction:
 class LoadedCapture:
     """Frames of a capture as they are solved, with the reason of each unusable one by its index in `lit`.
 
-    `common` has the levels of all usable frames; `notes` are sentences about the files of the PSFs.
+    `common` has the levels of all usable frames; `notes` are sentences about the files of the PSFs; `selected_s` is the
+    duration of the choice among several PSFs, which is part of a time budget.
     """
 
     frames: CaptureFrames
@@ -123,6 +124,7 @@ class LoadedCapture:
     common: LoadedRaw
     plan: "_CaptureSolvers"
     notes: tuple[str, ...]
+    selected_s: float
 
     @property
     def usable(self) -> tuple[LoadedRaw, ...]:
@@ -155,6 +157,7 @@ class CaptureReconstructor:
     ) -> None:
         self._options = options
         self._planner = planner or Planner(options.plans)
+        self._clock = SystemClock()
         self._single = FileReconstructor(options, self._planner)
         self._of_colours = of_colours or {}
         self._plans = LruCache[tuple[object, ...], _CaptureSolvers](KEPT_PLANS)
@@ -175,8 +178,10 @@ class CaptureReconstructor:
         common = common_raw([frame for k, frame in enumerate(lit) if k not in unusable])
         others = {name: tuple(load_raw(source) for source in sources) for name, sources in frames.colours.items()}
         _refuse_different(common, others)
-        plan, notes = self._plan(common, {name: common_raw(given) for name, given in others.items()}, frames)
-        return LoadedCapture(frames, lit, others, unusable, common, plan, notes)
+        plan, notes, selected_s = self._plan(
+            common, {name: common_raw(given) for name, given in others.items()}, frames
+        )
+        return LoadedCapture(frames, lit, others, unusable, common, plan, notes, selected_s)
 
     def solve(self, loaded: LoadedCapture) -> CaptureReconstruction:
         """Return the picture of a loaded capture; FrameError for frames that cannot be solved."""
@@ -190,20 +195,28 @@ class CaptureReconstructor:
         }
         dark = None if dark is None else np.nan_to_num(dark)
         made = loaded.plan.solve(
-            lit, loaded.unusable, dark, others, dark if frames.dark_fits_colours else None, frames.full_drive_s
+            lit,
+            loaded.unusable,
+            dark,
+            others,
+            dark if frames.dark_fits_colours else None,
+            frames.full_drive_s,
+            loaded.selected_s,
         )
         return self._reported(made, loaded)
 
     def _plan(
         self, common: LoadedRaw, others: Mapping[Colour, LoadedRaw], frames: CaptureFrames
-    ) -> tuple["_CaptureSolvers", tuple[str, ...]]:
-        """Return the solvers for the levels of a capture, and notes about the files of the PSFs.
+    ) -> tuple["_CaptureSolvers", tuple[str, ...], float]:
+        """Return the solvers for the levels of a capture, notes about the files of the PSFs, and seconds of the choice.
 
         `common` and `others` have the levels of all frames of a colour.
         """
         whole, notes = self._calibration(self._options, common)
         reference = in_light(whole, frames.light, common.name)
+        begin_s = self._clock.now_s()
         index = most_likely_psf(reference, common.raw.pixels, self._planner)[0] if len(reference.psfs) > 1 else 0
+        selected_s = self._clock.now_s() - begin_s
         counts = tuple((name, len(given) > 1, _levels(others[name])) for name, given in sorted(frames.colours.items()))
         key = common.solved_shape, _levels(common), len(frames.lit) > 1, frames.light, index, counts
 
@@ -211,7 +224,7 @@ class CaptureReconstructor:
             calibrations = {name: self._of_colour(name, raw, whole, reference) for name, raw in others.items()}
             return _CaptureSolvers(self._options, reference, calibrations, frames, self._planner, index)
 
-        return self._plans.get_or_make(key, plan), notes
+        return self._plans.get_or_make(key, plan), notes, selected_s
 
     def _of_colour(
         self, name: Colour, loaded: LoadedRaw, whole: Calibration, reference: Calibration
@@ -343,9 +356,12 @@ class _CaptureSolvers:
         others: Mapping[Colour, Sequence[Pixels]],
         others_dark: Image | None,
         full_drive_s: Mapping[Colour, float],
+        selected_s: float,
     ) -> Reconstruction:
         """Return the picture, with `colour` if another colour was solved; at least one frame of the burst is usable."""
-        deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
+        deadline = None
+        if self._budget_s is not None:
+            deadline = Deadline.after(self._clock, self._budget_s).later(-selected_s)
         order = sorted(range(len(lit)), key=lambda k: k in unusable)  # the first one must be usable
         reasons = {place: unusable[k] for place, k in enumerate(order) if k in unusable}
         solved = (

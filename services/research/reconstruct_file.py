@@ -271,12 +271,16 @@ class _FrameSolvers:
         """
         options = self._options
         pixels = loaded.raw.pixels
+        begin_s = self._clock.now_s()
         index = self._most_likely_psf(loaded)
+        selected_s = self._clock.now_s() - begin_s  # of the budget, unlike the plans
         if index not in self._solvers:
             self._solvers[index] = self._planned(index)
         solvers = self._solvers[index]
         frames = [pixels] if len(solvers) == 1 else [plane(pixels, c) for c in range(3)]
-        deadline = None if options.budget_s is None else Deadline.after(self._clock, options.budget_s)
+        deadline = None
+        if options.budget_s is not None:
+            deadline = Deadline.after(self._clock, options.budget_s).later(-selected_s)
         made = []
         for c, (solver, frame) in enumerate(zip(solvers, frames, strict=True)):
             shared = None if deadline is None else Deadline.after(self._clock, _share_s(deadline, len(frames) - c))

@@ -146,18 +146,21 @@ def test_capture_is_recomputed_and_time_limit_is_stored(technician_page: Page) -
     technician_page.keyboard.press("+")
     expect(kept).to_have_attribute("data-zoom", "3.00")
     assert layout_faults(technician_page, "eye-pic >> nth=1") == []
-    technician_page.get_by_role("button", name="Best").tap()
-    expect(technician_page.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
+    technician_page.get_by_role("button", name="Grey").tap()
+    expect(technician_page.get_by_role("button", name="Grey")).to_have_attribute("aria-pressed", "true")
+    choices = technician_page.get_by_role("group", name="How long a picture may take").get_by_role("button")
+    of_name = {"Grey": "0.26", "Quick": "1", "Standard": "5"}
+    expect(choices).to_have_text([f"{name} up to {s} s after the last frame" for name, s in of_name.items()])
     technician_page.reload()
     open_section(technician_page, "accuracy")
-    expect(technician_page.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
+    expect(technician_page.get_by_role("button", name="Grey")).to_have_attribute("aria-pressed", "true")
 
 
 def test_event_log_lists_events(technician_page: Page) -> None:
     open_section(technician_page, "event-log")
     expect(technician_page.locator(".event-log li").first).to_be_visible()
     text = technician_page.locator(".event-log").inner_text()
-    assert "a picture was kept after" in text
+    assert "a picture was made in" in text
     assert "started, version" in text
     assert layout_faults(technician_page, ".event-log li") == []
 
@@ -170,14 +173,14 @@ def test_event_log_is_filtered_and_exported(technician_page: Page) -> None:
     open_section(technician_page, "event-log")
     with technician_page.expect_download() as saved:
         technician_page.get_by_role("link", name="Save as a file").tap()
-    assert "a picture was kept after" in Path(saved.value.path()).read_text()
+    assert "a picture was made in" in Path(saved.value.path()).read_text()
     technician_page.get_by_role("button", name="Copy to USB").tap()
     expect(technician_page.get_by_role("button", name="LOCKED (read-only)")).to_be_disabled()
     with technician_page.expect_request("**/event-log/export") as asked:
         technician_page.get_by_role("button", name="BLUE").tap()
     assert asked.value.post_data_json == {"folder": stick["id"]}
     expect(technician_page.get_by_role("note")).to_have_text("Copied to BLUE/event-log-2026-11-22.")
-    entry = technician_page.locator(".event-log li", has_text="a picture was kept after")
+    entry = technician_page.locator(".event-log li", has_text="a picture was made in")
     entry.get_by_text("More").tap()
     entry.get_by_role("button", name="Only this picture").tap()
     expect(technician_page.get_by_text("Only what is about")).to_be_visible()

@@ -102,7 +102,7 @@ def _make_data(folder: Path) -> None:
         )
         AccuracyExplorer(
             rig.store.folder / "accuracy", Path(place), clock, spec, lambda *_, **__: None, measure_scene
-        ).choose("best")
+        ).choose("quick")
         PinAuthenticator(rig.store.folder / "technician.json", clock).set_pin(PIN, None)
         visit = next(
             candidate

@@ -439,11 +439,11 @@ def accuracy() -> list[dict[str, Any]]:
         again, at = "GET /api/technician/captures/{id}/again.png", f"/api/technician/captures/{made}/again.png"
         log.ask("GET /api/technician/accuracy", note="no technician is logged in")
         log.ask("POST /api/technician/accuracy", note="no technician is logged in")
-        log.ask("PUT /api/technician/pace", json={"pace": "best"}, note="no technician is logged in")
+        log.ask("PUT /api/technician/pace", json={"pace": "quick"}, note="no technician is logged in")
         log.ask(again, f"{at}?method=gradient", note="no technician is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
         log.ask("GET /api/technician/accuracy")
-        log.ask("PUT /api/technician/pace", json={"pace": "best"})
+        log.ask("PUT /api/technician/pace", json={"pace": "quick"})
         log.ask("PUT /api/technician/pace", json={"pace": "never"})
         log.ask(again, f"{at}?method=gradient&bin=2&rounds=3")
         log.ask(again, f"{at}?method=guess")

@@ -12,7 +12,8 @@ NAMED = (  # names are numbered by first appearance, so that equal names stay eq
     ("visit", r"\b\d{8}T\d{6}-[0-9a-f]{6}\b"),
     ("id", r"\b(?!0{8})[0-9a-f]{16}\b"),
 )
-MEASURED = {"report", "numbers", "verdict", "measured", "found", "placed", "x-aim"}  # floats below them are measured
+# floats below these are measured
+MEASURED = {"report", "numbers", "verdict", "measured", "found", "placed", "times", "x-aim"}
 COUNTS = {
     "free_bytes",
     "size_bytes",
@@ -23,6 +24,7 @@ COUNTS = {
     "took_s",
     "left_s",
     "spent_s",
+    "missed",
 }
 SENTENCES = {"message", "remedy", "sentence"}  # their words stand in one place, the source
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer

@@ -106,11 +106,11 @@ def test_a_capture_is_reconstructed_by_another_method_and_marked_as_simulated(
 
 def test_the_selected_time_budget_is_stored(explorer: AccuracyExplorer, tmp_path: Path, spec: InstrumentSpec) -> None:
     assert (explorer.pace, explorer.budget_s) == ("standard", 5.0)
-    explorer.choose("best")
+    explorer.choose("grey")
     again = AccuracyExplorer(
         tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, lambda kind, progress: None, measure_scene
     )
-    assert (again.pace, again.budget_s) == ("best", 30.0)
+    assert (again.pace, again.budget_s) == ("grey", 0.26)
     (tmp_path / "accuracy" / "choice.json").write_bytes(b"{half a fi")
     assert again.pace == "standard"
 

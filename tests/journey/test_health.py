@@ -29,6 +29,10 @@ def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait
         "settings",
         "power",
     }
+    times = well["times"]
+    assert times["pictures"] == 1
+    assert times["from_tap"]["p50_s"] > times["from_read_out"]["p50_s"] >= 0
+    assert (times["late"]["p99_s"] > 0.05 * 5.0) == (times["missed"] == 1)
     old_rig.world.faults.add("camera.missing")
     live_picture(old_rig.exam, 0, wait_s=0.0)
     wait_until(lambda: old_rig.exam.problem is not None)

@@ -1,5 +1,7 @@
 """Reconstruction of a burst of the instrument: quick look, joined frame, deadline, and a burst of one good frame."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -104,6 +106,30 @@ def test_a_deadline_without_time_to_join_gives_the_first_frame(bursts: BurstReco
     assert made.report.stopped == "deadline"
     later = picture(bursts, frames, Deadline.after(SystemClock(), 60))
     assert all(use.used for use in later.report.frames)
+
+
+@dataclass(frozen=True)
+class ShortSteps(Deadline):
+    """Deadline that leaves time for every step of at most `longest_s`."""
+
+    longest_s: float = 0.0
+
+    def fits(self, cost_s: float) -> bool:
+        return cost_s <= self.longest_s
+
+    def later(self, delay_s: float) -> "ShortSteps":
+        return self
+
+
+def test_frames_are_not_joined_without_time_for_a_round_after_it(bursts: BurstReconstructor, frames: list) -> None:
+    """Rounds on one frame are worth more than a joined frame that is not solved."""
+    picture(bursts, frames)  # measures the cost of each step
+    join_s = COUNT * (bursts.see_cost.seconds + bursts.join_cost.seconds)
+    stage = bursts.single.stages[-1]
+    assert stage.least_s < join_s
+    made = picture(bursts, frames, ShortSteps(SystemClock(), 0.0, join_s + 0.5 * stage.least_s))
+    assert [use.used for use in made.report.frames] == [True, False, False, False]
+    assert (made.report.seconds["join"], made.report.rounds) == (0.0, stage.most)
 
 
 class TimeToJoinOnly(Deadline):

@@ -36,6 +36,7 @@ from device.values import (
 from services.instrument.capture import ExposedCapture, Press, split_notes
 from services.instrument.capture_pipeline import CapturePipeline
 from services.instrument.press_exposure import expose_live, expose_press
+from services.instrument.time_budget import PACES_S, within_budget
 from services.records.capture_target import CaptureTarget
 from tests.journey.conftest import SMALL_HEAD
 from tests.property.exam_sequences import ROUND_S, ROUNDS, TINY, Conditions, PlainFeedback, TinyReconstructor
@@ -102,15 +103,56 @@ def test_a_failed_exposure_leaves_the_lamp_off(bench: Bench, fault: str, error: 
 def test_a_reconstruction_yields_a_quick_look_its_rounds_and_the_picture(bench: Bench) -> None:
     shot = bench.exposed()
     begin_s = bench.clock.now_s()
-    steps = list(bench.pipeline.reconstruct(shot, budget_s=5.0))
+    steps = list(bench.pipeline.reconstruct(shot))
     assert [type(step) for step in steps] == [StageResult, *[RoundDone] * ROUNDS, StageResult, Reconstruction]
     assert bench.clock.now_s() - begin_s == pytest.approx(ROUNDS * ROUND_S)
     assert bench.world.frames == 2, "a reconstruction exposes nothing"
 
 
+class SeesDeadline(TinyReconstructor):
+    """Reconstruction stand-in that keeps its deadline, in clock seconds."""
+
+    due_s = 0.0
+
+    def steps(self, *frames: Pixels, simulated: bool, deadline: Deadline | None = None) -> Iterator[Step]:
+        assert deadline is not None
+        self.due_s = deadline.due_s
+        yield from super().steps(*frames, simulated=simulated, deadline=deadline)
+
+
+def test_the_budget_counts_from_the_last_read_out_without_the_time_of_other_presses(bench: Bench) -> None:
+    solver = SeesDeadline(bench.clock, bench.conditions)
+    pipeline = CapturePipeline(bench.head, bench.clock, solver, solver, PlainFeedback())
+    shot = replace(bench.exposed(), budget_s=1.0)
+    read_out_s = bench.clock.now_s()
+    bench.clock.sleep(0.4)  # the verdict
+    list(pipeline.reconstruct(shot))
+    assert solver.due_s == pytest.approx(read_out_s + 1.0)
+    list(pipeline.reconstruct(shot, free_s=read_out_s + 0.3))
+    assert solver.due_s == pytest.approx(read_out_s + 1.3)
+
+
+def test_the_report_has_the_times_from_the_last_read_out_and_from_the_tap(bench: Bench) -> None:
+    shot = bench.exposed()
+    made_s = bench.clock.now_s() + 0.75
+    *_, made = bench.pipeline.reconstruct(shot)
+    assert isinstance(made, Reconstruction)
+    tapped = replace(shot, press=replace(shot.press, tapped_s=shot.exposure.begin_s - 0.25))
+    for of, from_tap_s in ((shot, None), (tapped, pytest.approx(0.25 + shot.exposure.duration_s + 0.75))):
+        report = bench.pipeline.record(of, made, shot.verdict, made_s)[0].report
+        assert (report.from_read_out_s, report.from_tap_s) == (pytest.approx(0.75), from_tap_s)
+
+
+def test_the_shortest_budget_takes_one_frame_in_one_light() -> None:
+    target = CaptureTarget(visit="v", slot="R-centre")
+    assert (target.frames, target.colours) == (4, ("red",))
+    assert within_budget(target, PACES_S["grey"]) == replace(target, frames=1, colours=())
+    assert within_budget(target, PACES_S["quick"]) == within_budget(target, PACES_S["standard"]) == target
+
+
 def test_a_quick_look_between_two_rounds_is_of_the_other_capture(bench: Bench) -> None:
     first, second = bench.exposed(), bench.exposed()
-    steps = bench.pipeline.reconstruct(first, budget_s=5.0)
+    steps = bench.pipeline.reconstruct(first)
     assert isinstance(next(steps), StageResult)
     assert isinstance(next(steps), RoundDone)
     quick = bench.pipeline.quick_look(second)
@@ -121,7 +163,7 @@ def test_a_quick_look_between_two_rounds_is_of_the_other_capture(bench: Bench) -
 def test_a_useless_frame_gives_the_raw_frame_with_the_error_in_its_report(bench: Bench) -> None:
     shot = bench.exposed()
     bench.conditions.is_frame_useless = True
-    (made,) = bench.pipeline.reconstruct(shot, budget_s=5.0)
+    (made,) = bench.pipeline.reconstruct(shot)
     assert isinstance(made, Reconstruction)
     assert (made.report.method, made.report.stopped) == ("none", "input.frame")
     assert np.array_equal(made.picture, shot.frame.counts)
@@ -130,9 +172,9 @@ def test_a_useless_frame_gives_the_raw_frame_with_the_error_in_its_report(bench:
 
 def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
     shot = bench.exposed()
-    *_, made = bench.pipeline.reconstruct(shot, budget_s=5.0)
+    *_, made = bench.pipeline.reconstruct(shot)
     assert isinstance(made, Reconstruction)
-    capture, files_of = bench.pipeline.record(shot, made, bench.pipeline.reassess(shot, made.report), 5.0)
+    capture, files_of = bench.pipeline.record(shot, made, bench.pipeline.reassess(shot, made.report), 2.0)
     assert (capture.id, capture.eye, capture.simulated) == (shot.id, "OD", True)
     assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
     assert capture.report.seconds["expose"] == pytest.approx(shot.exposure.duration_s)
@@ -347,7 +389,7 @@ def seen_lights(bench: Bench, *, white: bool, spoil: bool = False) -> Mapping[Co
         cut = {colour: replace(frame, counts=frame.counts[::2]) for colour, frame in taken.colours.items()}
         lit = tuple(replace(frame, counts=frame.counts[::2]) for frame in taken.lit)
         shot = replace(shot, exposure=replace(taken, lit=lit, colours=cut))
-    assert isinstance(list(pipeline.reconstruct(shot, budget_s=5.0))[-1], Reconstruction)
+    assert isinstance(list(pipeline.reconstruct(shot))[-1], Reconstruction)
     frames = {"green": taken.lit[0], "red": taken.colours["red"]}
     assert taken.dark is not None
     if white and not spoil:

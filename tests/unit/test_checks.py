@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from device.errors import BusFault, CameraMissing, HeadMismatch, StoreFull
-from services.health.checks import CHECKS, StatusSnapshot, run_checks
+from services.health.checks import CHECKS, PressTimes, StatusSnapshot, picture_times, run_checks
 from services.health.collector import read_throttled_bits
 from services.health.probe import table
 from services.records.recovery_report import RecoveryReport
@@ -31,7 +31,7 @@ HEALTHY = StatusSnapshot(
     now=NOON,
     clock="not_set",
     newest=datetime(2026, 11, 20, tzinfo=UTC),
-    presses=[(1.5, -3.5)] * 100,
+    presses=[PressTimes(1.5, 2.5, 5.0)] * 100,
     unsent=(4, 0),
     throttled_bits=0xE0000,
     unsaved_since=datetime(2026, 11, 14, 12, tzinfo=UTC),
@@ -51,9 +51,9 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("heat", {"head_c": BusFault("the thermometer does not answer")}),
     ("clock", {"now": datetime(2020, 1, 1, tzinfo=UTC)}),
     ("clock", {"newest": datetime(2026, 11, 22, tzinfo=UTC)}),
-    ("speed", {"presses": [(1.0, -4.0)] * 50 + [(9.0, 4.0)] * 50}),
+    ("speed", {"presses": [PressTimes(1.0, 2.0, 5.0)] * 50 + [PressTimes(9.0, 10.0, 5.0)] * 50}),
     ("sending", {"unsent": (4, 1)}),
-    ("speed", {"presses": [(2.5, 1.5)] * 100}),
+    ("speed", {"presses": [PressTimes(2.5, 3.5, 1.0)] * 100}),
     ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
     ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
     ("database", {"recovery": RecoveryReport(missing=["c"])}),
@@ -80,17 +80,31 @@ def test_each_check_fails_alone_with_a_remedy(name: str, change: dict[str, Any])
 
 
 def test_one_slow_press_in_a_hundred_is_accepted() -> None:
-    assert all(check.ok for check in run_checks(replace(HEALTHY, presses=[(1.0, -4.0)] * 99 + [(30.0, 25.0)])))
+    presses = [PressTimes(1.0, 2.0, 5.0)] * 99 + [PressTimes(30.0, 31.0, 5.0)]
+    assert all(check.ok for check in run_checks(replace(HEALTHY, presses=presses)))
 
 
 def test_of_two_presses_the_slower_one_counts() -> None:
-    speed = run_checks(replace(HEALTHY, presses=[(7.0, 2.0), (2.0, -3.0)]))[SPEED]
-    assert (speed.ok, speed.value) == (False, "half of 2 pictures within 2.0 s, 99 of 100 within 7.0 s, 2.0 s over")
+    speed = run_checks(replace(HEALTHY, presses=[PressTimes(7.0, 8.0, 5.0), PressTimes(2.0, 3.0, 5.0)]))[SPEED]
+    assert (speed.ok, speed.value) == (
+        False,
+        "of 2 pictures half within 2.00 s of the last frame and 3.00 s of the tap, "
+        "99 of 100 within 7.00 s and 8.00 s; 1 missed their deadline",
+    )
 
 
 def test_a_picture_within_its_time_budget_is_not_late() -> None:
-    """A time budget may be half a minute; a picture is late only beyond its budget."""
-    assert run_checks(replace(HEALTHY, presses=[(30.8, 0.8)] * 100))[SPEED].ok
+    assert run_checks(replace(HEALTHY, presses=[PressTimes(30.8, 31.6, 30.0)] * 100))[SPEED].ok
+
+
+def test_a_deadline_is_missed_by_more_than_a_twentieth_of_the_budget() -> None:
+    presses = [
+        PressTimes(took_s, took_s + 1.0, budget_s) for took_s, budget_s in ((0.27, 0.26), (0.28, 0.26), (5.3, 5.0))
+    ]
+    times = picture_times(presses)
+    assert times is not None
+    assert (times.pictures, times.missed) == (3, 2)
+    assert (times.from_read_out.p50_s, times.from_tap.p99_s) == (0.28, 6.3)
 
 
 def test_a_large_number_of_visits_is_not_shown() -> None:

@@ -46,8 +46,8 @@ class Bench:
     def look(self, image: Image, simulated: bool) -> None:
         self.looks.append((int(image[0, 0]), simulated, current_thread().name))
 
-    def preparation(self) -> FramePreparation:
-        return FramePreparation(self, self, "green", 5.0, self.look)
+    def preparation(self, *, refract: bool = True) -> FramePreparation:
+        return FramePreparation(self, self, "green", 5.0, self.look, refract)
 
 
 def frame(number: int, colour: Colour | None = "green") -> Frame:
@@ -66,6 +66,14 @@ def test_lit_frames_of_the_burst_are_prepared_with_the_dark_frame_in_a_thread() 
     ((look, simulated, thread),) = bench.looks
     assert (look, simulated, bench.refracted) == (1, True, [1]), "the first one alone"
     assert thread != current_thread().name
+
+
+def test_no_refraction_is_estimated_where_the_budget_is_too_short_for_it() -> None:
+    bench = Bench()
+    with bench.preparation(refract=False) as preparation:
+        preparation.add(frame(1))
+        preparation.finish()
+    assert (len(bench.looks), bench.refracted) == (1, [])
 
 
 def test_adding_a_frame_does_not_wait_for_its_preparation() -> None:

@@ -35,6 +35,7 @@ class KnownRefraction:
 
     whole_refraction: Refraction | NoRefraction
     is_done: bool = True
+    has_found: bool = True
     find_s: float = 0.0
     cylinder_s: float = 0.0
     join_s: float = 0.0
@@ -131,6 +132,26 @@ def test_predicted_gain_is_that_of_wiener_filters_on_drawn_objects() -> None:
     drawn_db = 10 * np.log10(errors[1] / errors[0])
     assert drawn_db > 0.5
     assert PsfGain(model)(eye, sphere, law, noise_dn) == pytest.approx(drawn_db, rel=0.05)
+
+
+@dataclass(frozen=True)
+class NoTimeToSearch(Deadline):
+    """Deadline that leaves time for every step but the search for a refraction, which took a minute before."""
+
+    def fits(self, cost_s: float) -> bool:
+        return cost_s < 60
+
+
+@pytest.mark.parametrize("has_found", [True, False])
+def test_a_refraction_that_is_found_already_takes_no_time(counts: Counts, has_found: bool) -> None:
+    planner = Planner(folder=None, effort="FFTW_ESTIMATE")
+    reconstruct = Reconstructor(CALIBRATION, moving_retina.SHAPE, planner, SystemClock(), timed=False)
+    slow = KnownRefraction(refraction(None), find_s=60.0)
+    picture(reconstruct, counts, slow)  # measures it
+    known = replace(slow, has_found=has_found)
+    made = picture(reconstruct, counts, known, NoTimeToSearch(SystemClock(), 0.0))
+    assert (made.report.psf_scale != 1) is has_found
+    assert (made.report.refraction_dpt is not None) is has_found
 
 
 def test_a_deadline_does_not_wait_for_the_cylinder(reconstruct: Reconstructor, counts: Counts) -> None:

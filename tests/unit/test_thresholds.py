@@ -13,7 +13,7 @@ from device.config.operating_limits import is_battery_low, is_too_hot
 from services.errors import UpdatePowerLow
 from services.health import alerts, thresholds
 from services.health.alerts import CoolingTimer
-from services.health.checks import Check, run_checks
+from services.health.checks import Check, PressTimes, run_checks
 from services.update.preconditions import refuse_while_in_use
 from services.update.settings import UpdateSettings
 from tests.appliance.instrument import served
@@ -97,7 +97,7 @@ def test_a_file_that_fits_exactly_beside_the_reserve_has_room(free: int, fits: b
 @pytest.mark.parametrize(("lateness_s", "late"), [(0.99, False), (1.0, False), (1.01, True)])
 def test_a_capture_at_the_largest_lateness_is_not_late(lateness_s: float, late: bool) -> None:
     assert thresholds.is_late(lateness_s) is late
-    assert check("speed", presses=[(2.0, lateness_s)] * 100).ok is not late
+    assert check("speed", presses=[PressTimes(2.0 + lateness_s, 4.0, 2.0)] * 100).ok is not late
     assert bool(list(alerts.lateness_alerts(lateness_s))) is late
 
 

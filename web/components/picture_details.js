@@ -1,6 +1,6 @@
 // Details dialog of a picture: reconstruction data, files to download, and the change to the other eye.
 
-import { versionName, whyGreen } from "./components.js";
+import { madeText, versionName, whyGreen } from "./components.js";
 import { icon } from "./icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { number, t } from "../i18n/translate.js";
@@ -31,7 +31,6 @@ function psfText({ gain_db: gain = null }) {
 }
 
 export function detailsDialog({ grey, visit }, actions, { record: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
-  const totalS = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
   const used = frames.filter((frame) => frame.used).length;
   const channels = report.channels ?? [];
@@ -44,7 +43,7 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
     ...(links.colour ? [["hue", t(channels.some((channel) => channel.white_ratio != null) ? "detail.hue.card" : "detail.hue.neutral")]] : []),
     ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
     ...(report.psf_cylinder ? [["psf", psfText(report.psf_cylinder)]] : []),
-    ["seconds", t("detail.seconds.value", { s: number(totalS, 2) })],
+    ...(madeText(report) ? [["seconds", madeText(report)]] : []),
     ["calibration", calibration],
     ["id", id],
   ];

@@ -133,9 +133,10 @@ function paceButtons({ pace, paces_s: paceButtons }, actions) {
     <div class="row" role="group" aria-labelledby="pace-title">
       ${Object.entries(paceButtons).map(([name, seconds]) => html`
         <button type="button" aria-pressed=${name === pace} @click=${() => actions.choose(name)}>
-          ${t(`pace.${name}`)} <small>${t("pace.seconds", { s: number(seconds) })}</small>
+          ${t(`pace.${name}`)} <small>${t("pace.seconds", { s: number(seconds, seconds < 1 ? 2 : 0) })}</small>
         </button>`)}
     </div>
+    <p>${t(`pace.${pace}.says`)}</p>
   `;
 }
 

@@ -9,7 +9,7 @@ from device.recon.model.field_of_view import field_radius_px
 from services.delivery.upload_worker import UploadWorker
 from services.health.alert_monitor import AlertMonitor
 from services.health.alerts import is_age_warning
-from services.health.checks import run_checks
+from services.health.checks import picture_times, run_checks
 from services.health.collector import collect_status
 from services.http.control_lease import ControlLease
 from services.http.problem_responses import problem_body
@@ -19,6 +19,7 @@ from services.http.schemas.status import (
     FindingAnswer,
     HealthAnswer,
     InterruptedCaptureAnswer,
+    PictureTimesAnswer,
     StatusAnswer,
     UploadCountsAnswer,
 )
@@ -61,6 +62,7 @@ def status_router(
         context = arbiter.context
         collected = collect_status(now, is_dark, context.store, repository, context.clock, unsent)
         checks = run_checks(collected)
+        times = picture_times(collected.presses)
         return HealthAnswer(
             ok=all(check.ok for check in checks),
             state=collected.state,
@@ -68,6 +70,7 @@ def status_router(
             battery=collected.battery if isinstance(collected.battery, float) else None,
             checks=[CheckAnswer.model_validate(check) for check in checks],
             calibration=[FindingAnswer.model_validate(finding) for finding in arbiter.findings],
+            times=None if times is None else PictureTimesAnswer.model_validate(times),
         )
 
     return router

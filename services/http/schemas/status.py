@@ -97,10 +97,30 @@ class FindingAnswer(ResponseBody):
     remedy: str
 
 
-class HealthAnswer(ResponseBody):
-    """Every health check, and the findings of the calibration monitor.
+class PercentilesAnswer(ResponseBody):
+    """50th and 99th percentile of a time, seconds."""
 
-    `ok` is true if all checks pass; `battery` is the charge from 0 to 1, or null.
+    p50_s: SignificantDigits
+    p99_s: SignificantDigits
+
+
+class PictureTimesAnswer(ResponseBody):
+    """Times of the last 100 pictures: from the last read-out, from the tap, and over the budget (negative: in time).
+
+    `missed`: pictures that were later than their time budget by more than 5 %.
+    """
+
+    pictures: int
+    missed: int
+    from_read_out: PercentilesAnswer
+    from_tap: PercentilesAnswer
+    late: PercentilesAnswer
+
+
+class HealthAnswer(ResponseBody):
+    """Every health check, the findings of the calibration monitor, and the times of the last pictures.
+
+    `ok` is true if all checks pass; `battery` is the charge from 0 to 1, or null; `times` is null without pictures.
     """
 
     ok: bool
@@ -109,3 +129,4 @@ class HealthAnswer(ResponseBody):
     battery: float | None
     checks: list[CheckAnswer]
     calibration: list[FindingAnswer]
+    times: PictureTimesAnswer | None

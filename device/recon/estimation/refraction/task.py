@@ -41,6 +41,11 @@ class RefractionTask:
         aside.shutdown(wait=False)
 
     @property
+    def has_found(self) -> bool:
+        """Whether `found` returns without waiting."""
+        return self._found.done()
+
+    @property
     def is_done(self) -> bool:
         """Whether `whole` returns without waiting."""
         return self._last.done()
