@@ -209,7 +209,7 @@ CASES: tuple[Case, ...] = (
         )
         for share, more_dn in ((0.0001, 1500), (0.001, 1500), (0.01, 300))
     ),
-    *(_case(f"{peak_e} e- peak", "little light", peak(peak_e), "", DIM) for peak_e in (50, 100, 250, 500)),
+    *(_case(f"{peak_e} e- peak", "little light", peak(peak_e), "dim", DIM) for peak_e in (50, 100, 250, 500)),
     *(
         _case(f"eye off by {more_dpt:+g} dpt", "wrong PSF", of_eye(more_dpt), "", OTHER_EYE)
         for more_dpt in (0.5, -1, 2, -4)

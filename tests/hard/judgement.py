@@ -30,6 +30,7 @@ BETTER: Mapping[str, int] = {  # 1: larger is better, -1: smaller
 KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("refraction", ("refraction",)),
     ("signal", ("no signal",)),
+    ("dim", ("too little light",)),
     ("eye", ("no eye", "from everywhere")),
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),

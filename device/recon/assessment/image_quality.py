@@ -20,6 +20,9 @@ NEAR_SQUARES = 5  # side of the surroundings of one: in little light a single sq
 MAX_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
 MAX_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
 NOISE_PARTS = 5  # frames without flicker have up to 3.6, at 250 electrons; 2 % of flicker there 17
+# Light of a whole frame over its noise. Drawn eyes on two sensors: 4100 to 5000 at 50 electrons at the peak (detail
+# correlates by 0.07 to 0.38 with the truth), 6300 and more at 100, 7700 and more at 144 (tests/hard/test_quality.py).
+MIN_LIGHT_SNR = 5500.0
 MAX_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the spectrum rise as the picture gets worse
 MAX_SATURATED = 0.001  # share of the pixels
 # Figures that use the PSF: set to None if the model does not explain the frame.
@@ -178,12 +181,18 @@ def psf_match(quality: dict[str, float | None]) -> Match:
 
 
 def quality_warnings(
-    quality: dict[str, float | None], match: Match, misfit: float | None, audience: Audience = Audience.OPERATOR
+    quality: dict[str, float | None],
+    match: Match,
+    misfit: float | None,
+    audience: Audience = Audience.OPERATOR,
+    light_snr: float | None = None,
 ) -> tuple[str, ...]:
     """Return the warnings about a picture in plain words, the most useful first; empty if there are none.
 
-    `misfit` is the rms residual in units of the noise; None if the field is unknown. The rules are the same for every
-    audience; the operator of the instrument reads what to do at the eye, the reader of a file what the frame shows.
+    `misfit` is the rms residual in units of the noise; None if the field is unknown. `light_snr` is the light of the
+    whole frame, over which each point of the retina spreads, over its noise; None if the head is unknown. The rules are
+    the same for every audience; the operator of the instrument reads what to do at the eye, the reader of a file what
+    the frame shows.
     """
     found = []
     explained = is_explained(quality, match, misfit)
@@ -198,6 +207,8 @@ def quality_warnings(
         found.append("unexplained")
     if explained and not is_lit(quality):
         found.append("partly lit")
+    if explained and light_snr is not None and light_snr < MIN_LIGHT_SNR:
+        found.append("too dark")
     words = _words_for_files(quality) if audience is Audience.FILES else _words_for_operators(quality)
     return tuple(MISMATCHES[match] if cause == "mismatch" else words[cause] for cause in found)
 
@@ -213,6 +224,7 @@ def _words_for_operators(quality: dict[str, float | None]) -> dict[str, str]:
             f"Only {quality.get('coverage') or 0:.0%} of the field is lit. Ask to look at the green light; "
             "take it again."
         ),
+        "too dark": "Too little light came back for vessels. Centre the ring on the pupil; take it again.",
     }
 
 
@@ -225,4 +237,5 @@ def _words_for_files(quality: dict[str, float | None]) -> dict[str, str]:
             "Flicker and stray light are possible causes."
         ),
         "partly lit": f"Only {quality.get('coverage') or 0:.0%} of the field is lit: the rest of the picture is dark.",
+        "too dark": "This frame holds too little light for vessels: what looks like one may be noise.",
     }
