@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 ResumedTarget = Callable[[ResumableCapture], CaptureTarget]
 
 SHORTER = "the instrument stopped before this picture was stored: {taken} of {planned} frames were on the disk"
-WHOLE = "the instrument stopped before this picture was stored: it was made at the next start"
+MADE_AT_START = "the instrument stopped before this picture was stored: it was made at the next start"
 CALIBRATION_DARK = "the dark frame was not on the disk: that of the calibration was subtracted"
 NO_DARK = "the dark frame was not on the disk, and the calibration has none: the black level was subtracted"
 OTHER_CALIBRATION = "the frames were taken with calibration {before}"
@@ -118,7 +118,7 @@ def _notes(
 ) -> tuple[str, ...]:
     """Return the warnings: how many frames there are, which dark frame is subtracted, another calibration."""
     is_whole = taken.dark is not None and len(taken.lit) >= stored.planned
-    notes = [WHOLE if is_whole else SHORTER.format(taken=len(taken.lit), planned=stored.planned)]
+    notes = [MADE_AT_START if is_whole else SHORTER.format(taken=len(taken.lit), planned=stored.planned)]
     if taken.dark is None:
         notes.append(NO_DARK if calibration.dark_dn is None else CALIBRATION_DARK)
     if calibration_id != calibration.id:

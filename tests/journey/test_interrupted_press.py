@@ -18,7 +18,7 @@ from services.errors import Busy, ConsentDeclined
 from services.instrument.capture_pipeline import INTERRUPTED
 from services.instrument.events import EventBus
 from services.instrument.exam_loop import POSTPONED, UNTIL_BACK
-from services.instrument.resumption import CALIBRATION_DARK, NO_DARK, SHORTER, WHOLE
+from services.instrument.resumption import CALIBRATION_DARK, MADE_AT_START, NO_DARK, SHORTER
 from services.records import digested_json
 from services.records.capture_journal import MAX_ATTEMPTS
 from services.records.capture_target import CaptureTarget
@@ -252,7 +252,7 @@ def test_sigkill_between_frames_and_during_the_reconstruction(environment: dict[
     with server.running():
         report = repeated_press(server, whole)
         assert len(report["frames"]) == 4
-        assert WHOLE in report["warnings"]
+        assert MADE_AT_START in report["warnings"]
         assert server.listed() == [whole.id, shorter.id]
     assert list((data / "journal").iterdir()) == []
 

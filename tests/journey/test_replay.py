@@ -22,7 +22,7 @@ from services.imaging.picture_files import raw_tiff, read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
-from services.instrument.resumption import WHOLE, ResumedTarget
+from services.instrument.resumption import MADE_AT_START, ResumedTarget
 from services.instrument.watchdog import Watchdog
 from services.records.capture import BUDGET_S, Capture
 from services.records.capture_journal import ResumableCapture
@@ -147,7 +147,7 @@ def test_a_press_on_a_recording_that_is_resumed_with_its_one_frame_is_whole(
         exam = begun(opened(folder), store, EventBus(), VirtualClock(), plans, same_colours)
         capture = exam.press("OD", key).result(60)
         exam.close()
-    assert WHOLE in capture.report.warnings
+    assert MADE_AT_START in capture.report.warnings
     assert {"raw.tiff", "dark.tiff"} <= set(capture.files)
 
 

@@ -16,7 +16,7 @@ from device.values import ExposureSettings, Frame
 from services.errors import StoreLocked
 from services.instrument.events import EventBus
 from services.instrument.exam_loop import LOCK_PATIENCE_S
-from services.instrument.resumption import WHOLE
+from services.instrument.resumption import MADE_AT_START
 from services.records import schema
 from services.records.capture_target import CaptureTarget
 from services.records.protocol import load_protocol
@@ -180,7 +180,7 @@ def test_a_picture_that_cannot_be_stored_is_made_at_the_next_start(
         until(lambda: rig.store.captures() != [], 60)
         (kept,) = rig.store.captures()
         assert set(frames) <= set(kept.files)
-        assert WHOLE in kept.report.warnings
+        assert MADE_AT_START in kept.report.warnings
         assert rig.world.frames == 0, "nothing is exposed again"
         assert rig.exam.head.light.ledger.spent_j_per_cm2("OD") == pytest.approx(spent_j_per_cm2)
         until(lambda: list((rig.store.folder / "journal").iterdir()) == [])
