@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from device.clock import Clock
 from device.errors import FrameError
-from device.recon.assessment.image_quality import NO_SIGNAL
+from device.recon.assessment.quality_figures import NO_SIGNAL
 from device.recon.estimation.group_registration import register_group
 from device.recon.estimation.registration import Registrar
 from device.recon.model import kernels

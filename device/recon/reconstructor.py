@@ -16,7 +16,8 @@ import numpy as np
 
 from device.clock import Clock, Deadline
 from device.errors import FrameError, SettingError
-from device.recon.assessment.image_quality import (
+from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
+from device.recon.assessment.quality_figures import (
     NO_SIGNAL,
     PSF_FIGURES,
     Audience,
@@ -26,7 +27,6 @@ from device.recon.assessment.image_quality import (
     psf_match,
     quality_warnings,
 )
-from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.power_law_prior import PowerLaw
 from device.recon.estimation.psf_gain import PsfGain

@@ -21,7 +21,7 @@ from device.errors import SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction
 from device.optics.illumination import MEAN_OVER_PEAK, PEAK_UM
 from device.optics.led_cap import LedCap, dark_deg
-from device.optics.lit_field import cap_of
+from device.optics.lit_angle import cap_of
 from device.sim.fundus import Fundus
 from device.sim.head_light import HeadLight, head_light
 from device.sim.sensor import SensorModel

@@ -4,7 +4,7 @@ import numpy as np
 
 from device.optics.diffuser import Refraction, steepest_rad
 from device.optics.eye import correction_dpt
-from device.optics.lit_field import picture_field_deg
+from device.optics.lit_angle import picture_field_deg
 from device.sim.effects.sensor import hot_pixels
 from device.sim.optical_setup import OpticalSetup
 from device.sim.render import convolved_with_disc, crop_or_pad, psf

@@ -24,7 +24,7 @@ from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationError, DiffuscopeError, FrameError, StoreError
 from device.head import Head
-from device.optics.lit_field import has_sharp_edge
+from device.optics.lit_angle import has_sharp_edge
 from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
 from device.recon.estimation.refraction.estimator import RefractionEstimator

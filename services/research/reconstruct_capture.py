@@ -15,7 +15,7 @@ import numpy as np
 from device.clock import Deadline, SystemClock
 from device.errors import FrameError
 from device.recon.assessment.exposure_split import dark_fits
-from device.recon.assessment.image_quality import NO_SIGNAL
+from device.recon.assessment.quality_figures import NO_SIGNAL
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor, without_psf
 from device.recon.estimation.psf_selection import most_likely_psf

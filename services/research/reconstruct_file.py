@@ -18,8 +18,8 @@ from device.config import bayer
 from device.config.bayer import BayerOption
 from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
-from device.recon.assessment.image_quality import MISMATCHES, NO_SIGNAL, Audience
 from device.recon.assessment.psf_consistency import PsfConsistency
+from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, Audience
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings

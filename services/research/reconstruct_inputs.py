@@ -30,7 +30,7 @@ from device.config.image_files import (
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError, SettingError, SpecError
-from device.optics.lit_field import picture_field_deg
+from device.optics.lit_angle import picture_field_deg
 from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels

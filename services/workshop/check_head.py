@@ -15,7 +15,7 @@ from device.clock import Clock
 from device.config.head_file import CalibrationTable, InstrumentSpec
 from device.errors import HeadMismatch
 from device.head import Bench, open_bench
-from device.optics.lit_field import has_sharp_edge
+from device.optics.lit_angle import has_sharp_edge
 from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
 from device.recon.estimation.refraction.estimator import RefractionEstimator, can_estimate_refraction
 from device.recon.model.fft_plans import Planner

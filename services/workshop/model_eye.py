@@ -27,8 +27,8 @@ from device.optics.budget import optical_budget
 from device.optics.illumination import MEAN_OVER_PEAK, half_period_deg
 from device.optics.led_cap import LedCap, dark_deg, relative_intensity
 from device.optics.light_budget import chain, log_sd
-from device.optics.lit_field import cap_of
-from device.recon.assessment.image_quality import MISMATCHES
+from device.optics.lit_angle import cap_of
+from device.recon.assessment.quality_figures import MISMATCHES
 from device.values import ExposureSettings, Illumination, Image
 from services import resources
 from services.research.reconstruct_file import reconstruct_file

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from device.config.head_file import InstrumentSpec, load_head
 from device.config.image_files import read_psf
-from device.recon.assessment.image_quality import MISMATCHES
+from device.recon.assessment.quality_figures import MISMATCHES
 from device.sim.scene_files import simulate_exposure
 from device.values import Image, Report
 from services.research.reconstruct_file import reconstruct_file

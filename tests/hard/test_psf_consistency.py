@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from device.config.head_file import load_head
-from device.recon.assessment.image_quality import MISMATCHES
 from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
+from device.recon.assessment.quality_figures import MISMATCHES
 from device.sim.scene_files import SimulatedExposure, simulate_exposure
 from device.values import Calibration, Counts, Image, Psf
 from services.research.reconstruct_file import reconstruct_file

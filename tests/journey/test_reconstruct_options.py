@@ -12,8 +12,8 @@ from scipy import ndimage
 
 from device.config.bayer import mosaic_of
 from device.config.image_files import read_image
-from device.recon.assessment.image_quality import Audience, quality_warnings
 from device.recon.assessment.psf_consistency import Match
+from device.recon.assessment.quality_figures import Audience, quality_warnings
 from services.research.reconstruct_file import FileReconstructor, reconstruct_file
 from services.research.reconstruct_inputs import ReconstructOptions, concentration
 from tests.journey.wrong_inputs import SHAPE, Answer, call, caustic, reconstruct, scene, write_right_inputs

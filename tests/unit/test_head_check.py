@@ -21,7 +21,7 @@ from device.calibration.monitoring.head_check import (
 from device.clock import VirtualClock
 from device.config.head_file import CameraSpec, load_head
 from device.errors import CalibrationExpired, CalibrationModeMismatch, CalibrationStale
-from device.optics.lit_field import has_sharp_edge
+from device.optics.lit_angle import has_sharp_edge
 from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
 from device.recon.estimation.refraction.estimator import RefractionEstimator

@@ -5,7 +5,7 @@ from math import log
 import numpy as np
 import pytest
 
-from device.recon.assessment import image_quality
+from device.recon.assessment import quality_figures
 from device.recon.assessment.psf_consistency import sparsity
 from device.recon.estimation.parameter_selection import MU_CANDIDATES, FrequencySample, cross_validated
 from device.recon.estimation.power_law_prior import BINS, PowerLaw, PowerLawPrior
@@ -93,8 +93,8 @@ def test_banding_is_the_rms_of_the_row_means_beyond_the_noise() -> None:
     noise_dn, light_dn, rows, cols = 20.0, 1000.0, 200, 400
     left = np.random.default_rng(5).normal(0, noise_dn, (rows, cols)).astype(np.float32)
     bands = 0.01 * light_dn * np.sin(np.arange(rows) / 3)[:, None].astype(np.float32)
-    assert image_quality.banding(left, noise_dn**2, light_dn) == 0
-    assert image_quality.banding(left + bands, noise_dn**2, light_dn) == pytest.approx(0.01 / 2**0.5, rel=0.1)
+    assert quality_figures.banding(left, noise_dn**2, light_dn) == 0
+    assert quality_figures.banding(left + bands, noise_dn**2, light_dn) == pytest.approx(0.01 / 2**0.5, rel=0.1)
 
 
 @pytest.mark.parametrize("lit", [1.0, 0.5])
@@ -105,11 +105,11 @@ def test_the_coverage_is_the_lit_share_of_the_field_also_in_noise(lit: float) ->
     light = mask * (right >= 0 if lit < 1 else 1)
     noisy = np.maximum(light + np.random.default_rng(0).normal(0, 1, light.shape) * light, 0).astype(np.float32)
     for picture in (light, noisy):
-        assert image_quality.coverage(picture, mask, 0.0) == pytest.approx(lit, abs=0.04)
+        assert quality_figures.coverage(picture, mask, 0.0) == pytest.approx(lit, abs=0.04)
 
 
 def test_the_coverage_of_a_field_without_samples_is_zero() -> None:
-    assert image_quality.coverage(np.ones((8, 8), np.float32), np.zeros((8, 8), np.float32), 0.0) == 0
+    assert quality_figures.coverage(np.ones((8, 8), np.float32), np.zeros((8, 8), np.float32), 0.0) == 0
 
 
 def test_the_cutoff_is_the_frequency_of_equal_signal_and_noise(model: Model) -> None:
@@ -118,7 +118,7 @@ def test_the_cutoff_is_the_frequency_of_equal_signal_and_noise(model: Model) -> 
     snr = prior.power * np.exp(law.log_power - law.slope * prior.logs) / s2
     below = [b for b in range(BINS) if snr[prior.bins == b].mean() < 1]
     edges = np.geomspace(prior.low, prior.high, BINS + 1)
-    limit = image_quality.cutoff(prior, law, s2, 2, scenes.GEOMETRY)
+    limit = quality_figures.cutoff(prior, law, s2, 2, scenes.GEOMETRY)
     assert 0 < below[0] < BINS
     assert limit.cycles_per_px == pytest.approx(edges[below[0]] / 2)
     assert limit.half_period_um == pytest.approx(0.5 / (limit.cycles_per_px * scenes.GEOMETRY.px_per_deg) * 296.7)

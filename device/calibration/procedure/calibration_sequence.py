@@ -33,7 +33,7 @@ from device.calibration.procedure.step_exposures import SHORTEST_S, StepExposure
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationRefused
-from device.optics.lit_field import picture_field_deg
+from device.optics.lit_angle import picture_field_deg
 from device.ports import Camera, Thermometer
 from device.values import Calibration, Colour, Frame, Geometry, Psf, Sensor
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from device.recon.assessment.frame_quality import MAX_WIDE, MIN_COVERAGE, MIN_WIDE, ONE_SIDED, FrameFigures
-from device.recon.assessment.image_quality import MAX_SATURATED, MIN_THROUGH
+from device.recon.assessment.quality_figures import MAX_SATURATED, MIN_THROUGH
 from device.values import Image
 
 AimCode = Literal["ready", "noeye", "closer", "back", "left", "right", "up", "down", "still", "dark", "bright"]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from device.errors import FrameError
-from device.recon.assessment.image_quality import MAX_SATURATED, MIN_THROUGH
+from device.recon.assessment.quality_figures import MAX_SATURATED, MIN_THROUGH
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px

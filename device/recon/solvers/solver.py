@@ -15,7 +15,7 @@ class Diagnostics:
     """Parameters and figures of the last frame, for the report.
 
     What a solver does not know stays at its default. The keys of `quality` that the report interprets are
-    in `assessment/image_quality.py`.
+    in `assessment/quality_figures.py`.
 
     Attributes
     ----------

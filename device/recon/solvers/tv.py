@@ -14,7 +14,7 @@ from math import isfinite
 
 import numpy as np
 
-from device.recon.assessment import image_quality
+from device.recon.assessment import quality_figures
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.estimation.power_law_prior import Fit, PowerLaw, PowerLawPrior
@@ -168,8 +168,8 @@ class EvidenceWiener:
 
     def _quality(self, fit: Fit, mean_dn: float) -> dict[str, float | None]:
         noise_dn2 = self.detail.noise_dn2
-        limit = image_quality.cutoff(self.prior, fit.law, noise_dn2, self.model.grid.n, self.geometry)
-        nats, sure = image_quality.structure(self.prior, fit.seen, fit.levels, noise_dn2)
+        limit = quality_figures.cutoff(self.prior, fit.law, noise_dn2, self.model.grid.n, self.geometry)
+        nats, sure = quality_figures.structure(self.prior, fit.seen, fit.levels, noise_dn2)
         return {
             "structure_nats": nats,
             "structure_sure": sure,
@@ -199,7 +199,7 @@ class EvidenceWiener:
         out *= self.model.mask
         noise_dn = float(self.detail.noise.variance_dn2(self.level) ** 0.5)
         if isfinite(self.model.grid.radius_samples):  # without a known field the lit share is undefined
-            coverage = image_quality.coverage(out, self.model.mask, noise_dn)
+            coverage = quality_figures.coverage(out, self.model.mask, noise_dn)
             self._add_diagnostics(Diagnostics(quality={"coverage": coverage}))
 
 
@@ -315,5 +315,5 @@ class TotalVariation(EvidenceWiener):
         if isfinite(grid.radius_samples):  # otherwise light from outside the frame causes bands, too
             left = (self._y - self.blurred[grid.slices]) * self._good
             light_dn = self.detail.mean_dn
-            banding = image_quality.banding(left, noise.variance_dn2(light_dn), light_dn)
+            banding = quality_figures.banding(left, noise.variance_dn2(light_dn), light_dn)
             self._add_diagnostics(Diagnostics(quality={"banding": banding}))

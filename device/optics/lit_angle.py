@@ -1,6 +1,7 @@
-"""Field that a head lights in fact: wider than its cap's cone where the dies of its LEDs are no points (OPTICS.md 4.9).
+"""Full angle of the field that a head lights, and whether its edge is sharp (OPTICS.md 4.9).
 
-Only a constant-current ring states the width of its dies; the matrix's are small, and its field keeps a sharp edge.
+It is wider than the cone of its cap where the dies of its LEDs are no points. Only a constant-current ring states the
+width of its dies; the matrix's are small, and its field keeps a sharp edge.
 """
 
 from functools import cache
