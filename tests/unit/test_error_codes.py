@@ -26,6 +26,7 @@ PAGE_CODES = {
     "power.lost": "interrupted captures in the status",
     "shot.crossed": "both eyes were probably exchanged",
     "shot.lost": "the answer to a press is missing",
+    "shot.next": "a good picture, after which the page has gone on",
 }
 ALERTS = text("web/core/alerts.js")
 ENGLISH = {re.sub("_(one|other)$", "", key) for key in json.loads(text("web/i18n/en.json"))}
