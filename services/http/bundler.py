@@ -1,6 +1,6 @@
 """Bundler: an ES module with all its imports as one file, so that a browser sends one request instead of thirty.
 
-Source lines stay as they are in `web/`, except for import and export lines; documentation comments are left out. Each
+Source lines stay as they are in `web/`, except for import and export lines; comments of whole lines are left out. Each
 module becomes a function, called once, in the order in which a browser evaluates modules. Modules that are loaded on
 demand import the bundled ones through re-export stubs of the same names, so that both see the same objects. A
 browser resolves an `import()` in a bundled module from the address of the entry: its path is relative to the entry.
@@ -15,7 +15,7 @@ _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (?:(\w+)|\
 _LIST = re.compile(r"\bexport ?\{([^{}]*)\};?\s*(?://.*\s*)?\Z")  # the export list at the end of a vendored module
 _UNSUPPORTED = re.compile(r"^(?:import|export)\b.*|^.*\bimport\.meta\b.*|^.*\bimport\((?!\"\.).*", re.M)
 _ON_DEMAND = re.compile(r'(?<=\bimport\()"(\.[^"]+)"')
-_DOCUMENTATION = re.compile(r"^[ \t]*/\*\*(?:(?!\*/).)*\*/\n", re.M | re.S)  # whole lines only
+_COMMENT = re.compile(r"^[ \t]*(?:/\*\*(?:(?!\*/).)*\*/|//[^\n]*)\n", re.M | re.S)  # of whole lines
 _SHEET = re.compile(r'^@import "([^"]+)";$', re.M)
 
 Read = Callable[[str], str]
@@ -28,7 +28,7 @@ def bundle_module(entry: str, read: Read) -> dict[str, str]:
     """
     order: list[str] = []
     _walk(entry, read, order, ())
-    bodies = {name: _Module(name, _DOCUMENTATION.sub("", read(name)), entry) for name in order}
+    bodies = {name: _Module(name, _COMMENT.sub("", read(name)), entry) for name in order}
     last = bodies.pop(entry)
     parts = [body.as_part() for body in bodies.values()]
     shared = ", ".join(f'"{name}": {_identifier(name)}' for name in bodies)
