@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from math import isfinite, isinf, prod
+from math import isfinite, isinf
 from threading import Lock
 
 import numpy as np
@@ -24,6 +24,7 @@ from device.recon.assessment.quality_figures import (
     is_explained,
     is_lit,
     is_measured,
+    light_over_noise,
     psf_match,
     quality_warnings,
 )
@@ -545,12 +546,6 @@ class Reconstructor:
                 f"the frame has {counts.shape[:2]} pixels, the calibration {self.shape}", "Use the head's own PSF."
             )
 
-    def _light_snr(self, mean_dn: float, noise_dn: float | None) -> float | None:
-        """Return the light of the whole frame over its noise; None for a recording of no head, or of unknown noise."""
-        if self.calibration.geometry is None or not noise_dn:
-            return None
-        return float(mean_dn / noise_dn * prod(self.shape) ** 0.5)
-
     def _report(self, run: "_Run", seconds: dict[str, float], check: Check | None) -> Report:
         assert run.solved is not None
         recipe = run.done.recipe
@@ -564,8 +559,8 @@ class Reconstructor:
             figures = check.result() if check else self._consistency(run.counts, psf_scale, run.known_defects)
             match = _checked_match(figures, quality)
         noise_dn = None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin
-        light_snr = self._light_snr(run.solved.frame.mean_dn, noise_dn)
-        warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience, light_snr)
+        snr = light_over_noise(run.solved.frame.mean_dn, noise_dn, self.shape) if self.calibration.geometry else None
+        warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience, snr)
         explained = not dark and is_explained(quality, match, misfit)
         eye = self._reported_refraction(run.refraction, explained and is_lit(quality))
         quality |= {

@@ -52,6 +52,8 @@ def test_every_key_of_every_report_has_a_description() -> None:
         confirmed=EyeConfirmation(),
         device=RecordOrigin(),
         versions=(CaptureVersion(1, "a"),),
+        from_read_out_s=1.0,
+        from_tap_s=2.0,
     )
     properties = schema["properties"]
     assert isinstance(properties, dict)

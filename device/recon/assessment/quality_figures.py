@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,6 +179,11 @@ def psf_match(quality: dict[str, float | None]) -> Match:
     is_seen = (quality.get("cutoff_per_px") or 0.0) > 0
     surely_foreign = sure is not None and sure < -MISMATCH_SD and is_seen and missing <= MAX_MISSING
     return Match.FOREIGN if surely_foreign else Match.UNKNOWN
+
+
+def light_over_noise(mean_dn: float, noise_dn: float | None, shape: tuple[int, int]) -> float | None:
+    """Return the light of a whole frame of `shape` pixels over its noise; None if the noise of a pixel is unknown."""
+    return float(mean_dn / noise_dn * prod(shape) ** 0.5) if noise_dn else None
 
 
 def quality_warnings(
