@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers channel readme results effects parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers channel readme results effects parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -136,6 +136,9 @@ test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad fr
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
 	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR $(LONG_PAGES) $(filter-out $(LONG_PAGES) $(JOURNEYS),$(call tests_of,tests/browser))
+
+page-pictures: .venv/ready browser ## Take README's two pictures of the page again, on the real server with the simulated head.
+	@$(BIN)/python -m tests.browser.readme_pictures
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper --timeout 900 tests/physics

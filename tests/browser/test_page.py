@@ -1,6 +1,7 @@
 """The exam page on the real server with the simulated head: whole exam, restart, lost connection."""
 
 import gzip
+import json
 import re
 import signal
 import time
@@ -12,6 +13,7 @@ from playwright.sync_api import Page, Response, expect
 
 from tests.browser.conftest import Complaints, Server
 from tests.browser.looks import SIZES, look_for_faults
+from tests.browser.readme_pictures import LABELS, labels
 from tests.browser.walk import (
     SHUTTER,
     Open,
@@ -68,6 +70,15 @@ def press(page: Page, complaints: Complaints, how: Callable[[], None]) -> None:
 def page(page: Page, complaints: Complaints) -> Page:
     """A tablet page on the real server, aiming at the first slot of a new patient."""
     return a_new_person(page, complaints)
+
+
+def test_readme_shows_the_labels_of_the_page(page: Page, complaints: Complaints) -> None:
+    shown = json.loads(LABELS.read_text())
+    assert labels(page) == shown["aim"], "make page-pictures"
+    press(page, complaints, page.locator(SHUTTER).tap)
+    page.wait_for_selector(".stage[data-mark=final]")
+    in_colour = ["Colour" if label == "As taken" else label for label in labels(page)]  # a busy computer has no time for it
+    assert in_colour == shown["result"], "make page-pictures"
 
 
 def test_capture_and_viewer_by_touch(page: Page, complaints: Complaints) -> None:
