@@ -39,22 +39,25 @@ def photograph(page: Page, name: str) -> list[str]:
 def main() -> None:
     """Go from the home screen to the first picture, and save the two screens with their labels."""
     width, height = TABLET
-    with TemporaryDirectory() as scratch, sync_playwright() as playwright:
-        with closing(Server(Path(scratch) / "data")) as server:
-            if PLANS.is_dir():
-                shutil.copytree(PLANS, server.data / "plans")
-            server.start()
-            server.wait_until_ready()
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-            viewport = {"width": width, "height": height}
-            page = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True).new_page()  # type: ignore[arg-type]
-            page.goto(server.url)
-            page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
-            new_person(page)
-            shown = {"aim": photograph(page, "aim")}
-            take_picture(page)
-            shown["result"] = photograph(page, "result")
-            browser.close()
+    with (
+        TemporaryDirectory() as scratch,
+        closing(Server(Path(scratch) / "data")) as server,
+        sync_playwright() as playwright,
+    ):
+        if PLANS.is_dir():
+            shutil.copytree(PLANS, server.data / "plans")
+        server.start()
+        server.wait_until_ready()
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        viewport = {"width": width, "height": height}
+        page = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True).new_page()  # type: ignore[arg-type]
+        page.goto(server.url)
+        page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
+        new_person(page)
+        shown = {"aim": photograph(page, "aim")}
+        take_picture(page)
+        shown["result"] = photograph(page, "result")
+        browser.close()
     LABELS.write_text(json.dumps(shown, indent=1, ensure_ascii=False) + "\n")
 
 

@@ -77,7 +77,8 @@ def test_readme_shows_the_labels_of_the_page(page: Page, complaints: Complaints)
     assert labels(page) == shown["aim"], "make page-pictures"
     press(page, complaints, page.locator(SHUTTER).tap)
     page.wait_for_selector(".stage[data-mark=final]")
-    in_colour = ["Colour" if label == "As taken" else label for label in labels(page)]  # a busy computer has no time for it
+    # A busy computer may have no time for the colour.
+    in_colour = ["Colour" if label == "As taken" else label for label in labels(page)]
     assert in_colour == shown["result"], "make page-pictures"
 
 
