@@ -378,6 +378,7 @@ OF_THE_PAGE = {
     "light.cut": ("test_capture_edge_cases.py", "test_light_cut_returns_to_the_same_slot"),
     "shot.lost": ("test_capture_edge_cases.py", "test_lost_picture_is_reported_until_retaken"),
     "shot.crossed": ("test_capture_edge_cases.py", "test_not_possible_is_set_and_undone_while_aiming"),
+    "shot.next": ("test_one_button.py", "test_going_on_is_announced_and_undone"),
 }
 
 
