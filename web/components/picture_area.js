@@ -119,8 +119,12 @@ function promptOf(state) {
   return [hint.code === "ready" ? "ready" : "plain", HINT_ICONS[hint.code] ?? "ring", t(`aim.${hint.code}`)];
 }
 
-const notes = (state, capture, mark) =>
-  [t(mark), whyGreen(state.visit), capture?.record ? madeText(capture.record.report) : ""].filter(Boolean).join(" · ");
+/** @param {State} state */
+function notes(state, capture, mark) {
+  const words = [t(mark), whyGreen(state.visit)].filter(Boolean).join(" · ");
+  const made = capture?.record ? madeText(capture.record.report) : "";
+  return made ? html`${words}<span class="made"> · ${made}</span>` : words;
+}
 
 /** @param {State} state */
 function markPrompt(state) {
