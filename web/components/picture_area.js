@@ -4,7 +4,7 @@ import { icon } from "./icons.js";
 import { colourLink, finalPicture } from "../core/api.js";
 import { alertText } from "../core/alerts.js";
 import { allowsLight, consentOf, eyeOf, currentCapture } from "../core/state.js";
-import { chips, slotLabel, standing, topAlert, alertBar, madeText, versionName, whyGreen } from "./components.js";
+import { chips, slotLabel, standing, topAlert, alertBar, versionName, whyGreen } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
 
@@ -119,21 +119,16 @@ function promptOf(state) {
   return [hint.code === "ready" ? "ready" : "plain", HINT_ICONS[hint.code] ?? "ring", t(`aim.${hint.code}`)];
 }
 
-/** @param {State} state */
-function notes(state, capture, mark) {
-  const words = [t(mark), whyGreen(state.visit)].filter(Boolean).join(" · ");
-  const made = capture?.record ? madeText(capture.record.report) : "";
-  return made ? html`${words}<span class="made"> · ${made}</span>` : words;
-}
+const notes = (state, mark) => [t(mark), whyGreen(state.visit)].filter(Boolean).join(" · ");
 
 /** @param {State} state */
 function markPrompt(state) {
   const capture = currentCapture(state);
   if (capture?.stage.name === "expose" && !capture.verdict && !capture.record) return ["hold", "hand", t("make.expose")];
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
-  if (state.picture === "final" && capture?.verdict?.word === "again" && !state.version) return ["plain", "pen", notes(state, capture, "mark.final.again")];
+  if (state.picture === "final" && capture?.verdict?.word === "again" && !state.version) return ["plain", "pen", notes(state, "mark.final.again")];
   if (state.picture === "final" && state.version) return ["done", "check", t("version.note")];
-  if (state.picture === "final") return ["done", "check", notes(state, capture, "mark.final")];
+  if (state.picture === "final") return ["done", "check", notes(state, "mark.final")];
   if (!capture || capture.record) return ["wait", "wait", t("mark.opening")];
   return ["wait", "wait", t("make.refine")];
 }
