@@ -10,7 +10,7 @@ from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from tests.browser.alert_causes import CAUSES, StandingAlerts, alert
 from tests.browser.conftest import CHROMIUM
@@ -195,8 +195,8 @@ def main() -> None:
             for size in arguments.size or SIZES:
                 real = instruments.build(binning=4)
                 width, height = SIZES[size]
-                viewport = {"width": width, "height": height}
-                context = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True)  # type: ignore[arg-type]
+                viewport = ViewportSize(width=width, height=height)
+                context = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True)
                 context.add_init_script(f"localStorage.setItem('diffuscope.language', '{language}')")
                 photograph(context.new_page(), real, standing, arguments.folder / language / size)
                 context.close()

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from tests.browser.conftest import CHROMIUM, PLANS, TABLET, Server
 from tests.browser.walk import new_person, take_picture
@@ -49,8 +49,8 @@ def main() -> None:
         server.start()
         server.wait_until_ready()
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        viewport = {"width": width, "height": height}
-        page = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True).new_page()  # type: ignore[arg-type]
+        viewport = ViewportSize(width=width, height=height)
+        page = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True).new_page()
         page.goto(server.url)
         page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
         new_person(page)
