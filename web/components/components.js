@@ -7,7 +7,7 @@ import { icon, target } from "./icons.js";
 import { currentCapture, get, lostCaptures, missingPictures, slotPlan } from "../core/state.js";
 import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { calendarDay, has, number, t } from "../i18n/translate.js";
+import { calendarDay, has, t } from "../i18n/translate.js";
 
 /** @typedef {import("../core/state.js").State} State */
 
@@ -96,13 +96,6 @@ export const thumb = (visit, capture, actions) =>
   html`<img src=${captureFileUrl(capture, visit?.no_colour ? "green.jpg" : "quick.jpg")} alt="" loading="lazy" @load=${actions.thumbLoaded} @error=${actions.thumbFailed} />`;
 
 const LIGHT_LIMITS = ["light.limit", "light.day", "light.visit"];
-
-/** How long a picture took, of its time budget and from the tap; "" where it is not known. */
-export function madeText({ budget_s: budget, from_read_out_s: s = null, from_tap_s: tap = null }) {
-  const digits = budget < 1 ? 2 : 1;
-  if (s === null || tap === null) return "";
-  return t("made.in", { s: number(s, digits), budget: number(budget, digits), tap: number(tap, 1) });
-}
 
 /**
  * Why the pictures of a visit are shown in green light; "" for a visit in colour.
