@@ -16,7 +16,6 @@ from scipy import ndimage
 
 from device.clock import Clock
 from device.errors import FrameError
-from device.recon.assessment.quality_figures import NO_SIGNAL
 from device.recon.estimation.group_registration import register_group
 from device.recon.estimation.registration import Registrar
 from device.recon.model import kernels
@@ -28,6 +27,7 @@ from device.recon.model.preprocessing import Preprocessor
 from device.recon.model.resampling import add_moved_back, to_sensor
 from device.recon.reconstructor import (
     ROUND_DONE,
+    QuickLook,
     Reconstructor,
     RoundDone,
     default_schedule,
@@ -68,6 +68,12 @@ class SeenFrame:
     picture: Image
     mean_dn: float
     saturated: float | None
+
+
+def require_light(look: QuickLook) -> None:
+    """Raise FrameError unless a frame has light."""
+    if not look.solved.has_light:
+        raise FrameError("the frame holds no signal above the black level")
 
 
 class BurstJoiner:
@@ -146,20 +152,20 @@ class BurstJoiner:
         uses = [FrameUse(k, k not in reasons, shifts.get(k), 0.0, reasons.get(k)) for k in range(len(frames))]
         yield self._join(seen, field, uses)
 
-    def see(self, frame: Pixels, dark: Pixels | None) -> SeenFrame:
+    def see(self, frame: Pixels, dark: Pixels | None, look: QuickLook | None = None) -> SeenFrame:
         """Return a frame (rows, cols) in counts, ready to be joined; `dark` as for `steps`.
 
-        FrameError without light or with too many missing pixels.
+        `look`: its quick look, if there is one and quick looks are registered. FrameError without light or with too
+        many missing pixels.
         """
         counts = plane(frame, 0)
-        report = self._single(counts, dark, quick=True).report
-        saturated = report.quality["saturated"]
-        if NO_SIGNAL in report.warnings:
-            raise FrameError("the frame holds no signal above the black level")
+        if look is None or not self.registers_quick_looks:
+            look = self._single.quick_look(counts, dark)
+        require_light(look)
         # A preprocessor of its own: its light is the result, and that of all frames is needed at once.
         full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
-        linear = full(counts, dark, self._single.defects(counts, dark))
-        return SeenFrame(linear.y, linear.good > 0, self._stage.picture.copy(), linear.mean_dn, saturated)
+        linear = full(counts, dark, look.defects[0])
+        return SeenFrame(linear.y, linear.good > 0, look.planes[0], linear.mean_dn, look.solved.frame.saturated)
 
     def _field(self, pictures: Sequence[Image]) -> Image:
         """Return the lit field on the grid of the pictures, 0 to 1; found in their mean if it is not calibrated."""

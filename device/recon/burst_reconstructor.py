@@ -5,18 +5,19 @@ serves any N. Its read noise is taken as that of one frame: the missing factor s
 picture and its report are in DN of one exposure, that of the reference (`in_one_exposure`, NUMERICS.md 9.2).
 """
 
-from collections.abc import Container, Generator, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
 
 from device.clock import Deadline
-from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame
+from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame, require_light
 from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, StageResult, Step, noise_frame
+from device.recon.reconstructor import DurationEstimate, EyePsf, QuickLook, Reconstructor, RoundDone, Step, noise_frame
 from device.values import FrameUse, Reconstruction
 
 NO_TIME = "the time budget left no time to join the burst"
@@ -31,13 +32,13 @@ class PreparedFrame:
     look
         Quick look of the frame.
     seen
-        What is needed to join it.
+        What is needed to join it; None for a frame without others.
     refraction
         Task that estimates its refraction, if it has begun.
     """
 
-    look: StageResult
-    seen: SeenFrame
+    look: QuickLook
+    seen: SeenFrame | None
     refraction: RefractionTask | None = None
 
 
@@ -79,7 +80,15 @@ class BurstReconstructor:
             for step in run.join([noise, noise], np.zeros_like(noise)):
                 assert isinstance(step, RoundDone)
 
-    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
+    def prepare(
+        self,
+        counts: Pixels,
+        dark: Pixels | None = None,
+        *,
+        refract: bool = False,
+        cylinder: bool = True,
+        alone: bool = False,
+    ) -> PreparedFrame:
         """Return a frame with its quick look, ready for `steps`, while the next frames are exposed.
 
         Parameters
@@ -90,6 +99,10 @@ class BurstReconstructor:
             Dark frame of the same shape; None: that of the calibration.
         refract
             True: a thread begins to estimate its refraction. A burst needs it of its first used frame only.
+        cylinder
+            True: with the cylinder.
+        alone
+            True: there is no other frame to be joined with.
 
         Returns
         -------
@@ -101,13 +114,12 @@ class BurstReconstructor:
         FrameError
             The frame has no light, or too many missing pixels.
         """
-        seen = self.joiner.see(counts, dark)
-        stage = self.single.stages[0]
-        if not self.joiner.registers_quick_looks:
-            self.single(counts, dark, quick=True)
-        is_last = stage is self.single.stages[-1]
-        look = StageResult(stage.recipe, stage.shown.copy(), last=is_last)
-        task = self.single.begin_refraction(counts, dark, self.single.defects(counts, dark)) if refract else None
+        look = self.single.quick_look(counts, dark)
+        require_light(look)
+        seen = None if alone else self.joiner.see(counts, dark, look)
+        task = None
+        if refract:
+            task = self.single.begin_refraction(counts, dark, look.defects[0], with_cylinder=cylinder)
         return PreparedFrame(look, seen, task)
 
     def steps(
@@ -119,7 +131,8 @@ class BurstReconstructor:
         deadline: Deadline | None = None,
         unusable: Mapping[int, str] | None = None,
         prepared: Mapping[int, PreparedFrame] | None = None,
-        refract: bool = True,
+        eye_psf: EyePsf = EyePsf.ESTIMATED,
+        joined: JoinedFrame | None = None,
     ) -> Iterator[Step]:
         """Yield the quick look of the first frame, RoundDone after frames and rounds, and the picture of the burst.
 
@@ -141,8 +154,10 @@ class BurstReconstructor:
             Reason of each frame that must not enter the picture, by its index, never the first.
         prepared
             Frames that are prepared with this dark frame, by index.
-        refract
-            False: no refraction is estimated; the PSF is that of the last picture of this reconstructor.
+        eye_psf
+            PSF of the picture.
+        joined
+            The frames, if they are joined already.
 
         Yields
         ------
@@ -155,44 +170,55 @@ class BurstReconstructor:
             A frame has another shape, the first one has too many missing pixels for a quick look, or no frame
             can be used.
         """
-        run = _Run(self, deadline, refract)
+        run = _Run(self, deadline, eye_psf, joined)
         ready = dict(prepared or {})
         tasks = {k: prepared_frame.refraction for k, prepared_frame in ready.items()}
+        looks = {k: prepared_frame.look for k, prepared_frame in ready.items()}
         if len(frames) == 1:
             yield from self.single.steps(
-                frames[0], dark, simulated=simulated, deadline=deadline, refract=refract, refraction=tasks.get(0)
+                frames[0],
+                dark,
+                simulated=simulated,
+                deadline=deadline,
+                eye_psf=eye_psf,
+                refraction=tasks.get(0),
+                look=looks.get(0),
             )
             return
-        saturated = yield from self._quick_look(frames[0], dark, ready.get(0), simulated)
-        if not run.fits(self._cost_s(frames, ready, unusable) + self.single.stages[-1].least_s):
+        if 0 not in looks:
+            looks[0] = self.single.quick_look(frames[0], dark)
+        yield looks[0].stage
+        if joined is None and not run.fits(self._cost_s(frames, ready, unusable) + self.single.stages[-1].least_s):
             self.see_cost.halve_maximum()
             self.join_cost.halve_maximum()
             reasons = unusable or {}
             uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, reasons.get(k)) for k in range(len(frames))]
-            yield from run.solve_one(frames[0], dark, uses, 0, simulated, tasks.get(0))
+            yield from run.solve_one(frames[0], dark, uses, 0, simulated, tasks.get(0), looks[0])
             return
-        yield from run.join(frames, dark, unusable, {k: prepared_frame.seen for k, prepared_frame in ready.items()})
+        if joined is None:
+            yield from run.join(frames, dark, unusable, _seen(ready))
         assert run.joined is not None
         uses = run.joined.frames
         used = [use.index for use in uses if use.used]
+        known = tasks.get(used[0]), looks.get(used[0])
         if len(used) == 1:
-            yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated, tasks.get(used[0]))
+            yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated, *known)
         else:
-            yield from run.solve_joined([frames[k] for k in used], dark, saturated, simulated, tasks.get(used[0]))
+            saturated = looks[0].solved.frame.saturated
+            yield from run.solve_joined([frames[k] for k in used], dark, saturated, simulated, *known)
 
-    def _quick_look(
-        self, counts: Pixels, dark: Pixels | None, prepared: PreparedFrame | None, simulated: bool
-    ) -> Generator[Step, None, float | None]:
-        """Yield the quick look of a frame, and return its share of saturated pixels."""
-        if prepared is not None:
-            yield prepared.look
-            return prepared.seen.saturated
-        for step in self.single.steps(counts, dark, simulated=simulated, quick=True):
-            if isinstance(step, Reconstruction):
-                saturated: float | None = step.report.quality["saturated"]
-                return saturated
-            yield step
-        raise AssertionError("a reconstruction ends with a picture")
+    def join(
+        self,
+        frames: Sequence[Pixels],
+        dark: Pixels | None,
+        unusable: Mapping[int, str],
+        prepared: Mapping[int, PreparedFrame],
+    ) -> JoinedFrame:
+        """Return the joined frame for `steps` of the same frames; arguments and errors as for `steps`."""
+        run = _Run(self, None)
+        deque(run.join(frames, dark, unusable, _seen(prepared)), maxlen=0)
+        assert run.joined is not None
+        return run.joined
 
     def _cost_s(self, frames: Sequence[Pixels], ready: Container[int], unusable: Mapping[int, str] | None) -> float:
         """Return the estimated duration of joining the frames, in seconds; those that are `ready` cost less."""
@@ -201,12 +227,22 @@ class BurstReconstructor:
         return unseen * self.see_cost.seconds + len(usable) * self.join_cost.seconds
 
 
+def _seen(prepared: Mapping[int, PreparedFrame]) -> dict[int, SeenFrame]:
+    return {k: frame.seen for k, frame in prepared.items() if frame.seen is not None}
+
+
 class _Run:
     """State of the reconstruction of one burst: its deadline, the duration of joining, and the joined frame."""
 
-    def __init__(self, owner: "BurstReconstructor", deadline: Deadline | None, refract: bool = True) -> None:
-        self._owner, self._deadline, self._refract = owner, deadline, refract
-        self.joined: JoinedFrame | None = None
+    def __init__(
+        self,
+        owner: "BurstReconstructor",
+        deadline: Deadline | None,
+        eye_psf: EyePsf = EyePsf.ESTIMATED,
+        joined: JoinedFrame | None = None,
+    ) -> None:
+        self._owner, self._deadline, self._eye_psf = owner, deadline, eye_psf
+        self.joined = joined
         self._join_s = 0.0
 
     def fits(self, cost_s: float) -> bool:
@@ -242,8 +278,9 @@ class _Run:
         saturated: float | None,
         simulated: bool,
         refraction: RefractionTask | None,
+        look: QuickLook | None,
     ) -> Iterator[Step]:
-        """Yield the steps of the picture of the joined frames `used`; `saturated` and `refraction` are the first's."""
+        """Yield the steps of the picture of the joined frames `used`; the last arguments are the first frame's."""
         owner = self._owner
         joined = self.joined
         assert joined is not None
@@ -255,9 +292,10 @@ class _Run:
             simulated=simulated,
             deadline=self._deadline,
             joined=total,
-            refract=self._refract,
+            eye_psf=self._eye_psf,
             refraction=refraction,
             others=used[1:],
+            look=look,
         ):
             if isinstance(step, RoundDone):
                 yield step
@@ -279,18 +317,20 @@ class _Run:
         index: int,
         simulated: bool,
         refraction: RefractionTask | None,
+        look: QuickLook | None,
     ) -> Iterator[Step]:
         """Yield the steps of the picture of one frame, the one with this index; `uses` says why no other is used.
 
-        `refraction`: its task, if it has begun.
+        `refraction`: its task, if it has begun; `look`: its quick look, if there is one.
         """
         for step in self._owner.single.steps(
             counts,
             dark,
             simulated=simulated,
             deadline=self._deadline,
-            refract=self._refract,
+            eye_psf=self._eye_psf,
             refraction=refraction,
+            look=look,
         ):
             if isinstance(step, Reconstruction):
                 yield self._reported(step, only(index, uses))

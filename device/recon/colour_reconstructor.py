@@ -20,7 +20,7 @@ from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, picture
 from device.recon.model.field_of_view import field_box, field_radius_px, lit_field
 from device.recon.model.grid import Grid, disc
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
+from device.recon.reconstructor import DurationEstimate, EyePsf, Reconstructor, RoundDone, Step
 from device.recon.white_balance import balanced, white_ratios
 from device.values import ChannelUse, Colour, Geometry, Image, Reconstruction, Report
 
@@ -179,7 +179,7 @@ class ColourReconstructor:
             Earlier by what `colours` take at least, at most by half.
         """
         firsts = [self.singles[colour].stages[0] for colour in colours]
-        least_s = sum(first.start_cost.seconds + first.finish_cost.seconds for first in firsts)
+        least_s = sum(first.start_cost.seconds + first.end_cost.seconds + first.finish_cost.seconds for first in firsts)
         return deadline.later(-min(least_s + (self.join_cost.seconds if firsts else 0.0), deadline.left_s() / 2))
 
     def _join(self, pictures: Mapping[Colour, Image], n: int, lights_dn_per_s: Mapping[Colour, float]) -> ColourPicture:
@@ -264,9 +264,9 @@ class _Run:
         owner.refocus(colour, eye)
         deadline = None if self._deadline is None else self._deadline.later(-owner.join_cost.seconds)
         if isinstance(solver, BurstReconstructor):
-            steps = solver.steps(frames, dark, simulated=True, deadline=deadline, refract=False)
+            steps = solver.steps(frames, dark, simulated=True, deadline=deadline, eye_psf=EyePsf.KEPT)
         else:
-            steps = solver.steps(frames[0], dark, simulated=True, deadline=deadline, refract=False)
+            steps = solver.steps(frames[0], dark, simulated=True, deadline=deadline, eye_psf=EyePsf.KEPT)
         for step in steps:
             if isinstance(step, RoundDone):
                 paused_s = owner.clock.now_s()

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from enum import Enum
 from math import isfinite, isinf
 from threading import Lock
 
@@ -56,6 +57,14 @@ Check = Future[Consistency | None]
 CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
 
 
+class EyePsf(Enum):
+    """PSF with which the later stages of a frame are solved."""
+
+    ESTIMATED = "of the refraction that is estimated from the frame"
+    KEPT = "that of the picture before"
+    STORED = "that of the calibration"
+
+
 @dataclass(frozen=True)
 class Recipe:
     """Settings of one stage.
@@ -95,6 +104,47 @@ class StageResult:
     recipe: Recipe
     picture: Image
     last: bool
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The last frame that a solver has solved, and its diagnostics."""
+
+    frame: Linear
+    diagnostics: Diagnostics
+
+    @property
+    def has_light(self) -> bool:
+        """True if there is a signal above the black level."""
+        return self.frame.mean_dn > 0 and self.diagnostics.noise_dn != 0
+
+    @property
+    def quality(self) -> dict[str, float | None]:
+        """Figures of the frame and of the solver by their names in a report."""
+        figures = {"saturated": self.frame.saturated, "missing": self.frame.missing, "mean_dn": self.frame.mean_dn}
+        return {**figures, **self.diagnostics.quality}
+
+
+@dataclass(frozen=True)
+class QuickLook:
+    """The first stage of a frame, from which `Reconstructor.steps` of the same frame goes on.
+
+    Attributes
+    ----------
+    stage
+        Its result.
+    planes
+        Its whole picture (channels, rows, cols) on its grid.
+    solved
+        The frame and the diagnostics.
+    defects
+        Flat indices of the defective pixels of each channel, None if there are none.
+    """
+
+    stage: StageResult
+    planes: Image
+    solved: Solved
+    defects: Mapping[int, Places | None]
 
 
 @dataclass(frozen=True)
@@ -172,7 +222,8 @@ class _Stage:
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
         self.start_cost = DurationEstimate()
         self.round_cost = DurationEstimate()
-        self.finish_cost = DurationEstimate()
+        self.end_cost = DurationEstimate()  # of the solver, for one channel
+        self.finish_cost = DurationEstimate()  # of the picture on the sensor's grid, for all
 
     def refocus(self, otf: Spectrum, eye: Wavefront | None) -> None:
         """Use `otf`, the OTF of the PSF of `eye`, from the next `solver.start` on; no-op if in use."""
@@ -188,12 +239,13 @@ class _Stage:
 
     @property
     def least_s(self) -> float:
-        """Estimated minimum duration for one channel, seconds: start, one round and finish."""
-        return self.start_cost.seconds + self.round_cost.seconds + self.finish_cost.seconds
+        """Estimated minimum duration for one channel, seconds: start, one round, end and finish."""
+        ends_s = self.end_cost.seconds + self.finish_cost.seconds
+        return self.start_cost.seconds + self.round_cost.seconds + ends_s
 
     def halve_costs(self) -> None:
         """Halve the cost estimates after the stage was skipped; one slow run would otherwise block it forever."""
-        for cost in (self.start_cost, self.round_cost, self.finish_cost):
+        for cost in (self.start_cost, self.round_cost, self.end_cost, self.finish_cost):
             cost.halve_maximum()
 
     @property
@@ -303,6 +355,7 @@ class Reconstructor:
         for stage in self.stages:
             stage.start_cost = DurationEstimate()
             stage.round_cost = DurationEstimate()
+            stage.end_cost = DurationEstimate()
             stage.finish_cost = DurationEstimate()
         self._find_cost = DurationEstimate()
         self._cylinder_cost = DurationEstimate()
@@ -362,9 +415,10 @@ class Reconstructor:
         rounds: int | None = None,
         quick: bool = False,
         joined: Image | None = None,
-        refract: bool = True,
+        eye_psf: EyePsf = EyePsf.ESTIMATED,
         refraction: RefractionTask | None = None,
         others: Sequence[Pixels] = (),
+        look: QuickLook | None = None,
     ) -> Iterator[Step]:
         """Yield the result of each stage, then the best picture that fits into the deadline, with its report.
 
@@ -389,12 +443,15 @@ class Reconstructor:
         joined
             Sum of a burst, which the later stages solve instead of `counts`: linear DN above dark with the gain
             of the sensor, NaN for missing pixels.
-        refract
-            False: the later stages use the PSF of the picture before.
+        eye_psf
+            PSF of the later stages.
         refraction
             Task of this frame, if it has begun.
         others
             Other frames of its burst, which the refraction takes into account; not with a `deadline`.
+        look
+            Quick look of this frame with this dark frame, if there is one: the first of several stages is not solved
+            again.
 
         Yields
         ------
@@ -406,14 +463,20 @@ class Reconstructor:
         FrameError
             The frame has another shape than the sensor, or too many pixels are missing (`Preprocessor`).
         """
-        self._refuse_other_shapes(counts)
         run = _Run(self, counts, dark, deadline, rounds)
         task = refraction
         check: Check | None = None
         begin_s = self.clock.now_s()
-        for stage in self.stages[:1] if quick else self.stages:
-            if stage is self._refracted[0] and not quick and refract:
+        stages = self.stages[:1] if quick else self.stages
+        if look is not None and len(stages) > 1:
+            run.begin_with(stages[0], look)
+            yield look.stage
+            stages = stages[1:]
+        for stage in stages:
+            if stage is self._refracted[0] and not quick and eye_psf is EyePsf.ESTIMATED:
                 task = self._estimate_refraction(run, task, others)
+            elif stage is self._refracted[0] and eye_psf is EyePsf.STORED:
+                self._refocus(None)
             if not run.has_time_for(stage):
                 break
             check = self._begin_check(run, stage)
@@ -433,6 +496,33 @@ class Reconstructor:
         if isinstance(run.refraction, Refraction) or run.cylinder_s > 0:
             seconds["cylinder"] = run.cylinder_s
         yield Reconstruction(picture, self._report(run, seconds, check), simulated)
+
+    def quick_look(self, counts: Pixels, dark: Pixels | None = None) -> QuickLook:
+        """Return the first stage of a frame, for `steps` of this frame.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32, (rows, cols) or (rows, cols, 3).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+
+        Returns
+        -------
+        QuickLook
+            The first stage.
+
+        Raises
+        ------
+        FrameError
+            As `steps`.
+        """
+        run = _Run(self, counts, dark, None, None)
+        stage = self.stages[0]
+        deque(run.solve(stage, pauses=False, joined=None), maxlen=0)
+        assert run.solved is not None
+        shown = StageResult(stage.recipe, stage.shown.copy(), last=stage is self.stages[-1])
+        return QuickLook(shown, stage.planes.copy(), run.solved, run.found)
 
     def _begin_check(self, run: "_Run", stage: _Stage) -> Check | None:
         """Begin the PSF consistency check of a frame of one stage in a thread, beside its solver; not with a deadline.
@@ -539,18 +629,11 @@ class Reconstructor:
         if eye is not None:
             self._refocus_cost.add(self.clock.now_s() - begin_s)
 
-    def _refuse_other_shapes(self, counts: Pixels) -> None:
-        check_image_shape(counts.shape)
-        if counts.shape[:2] != self.shape:
-            raise FrameError(
-                f"the frame has {counts.shape[:2]} pixels, the calibration {self.shape}", "Use the head's own PSF."
-            )
-
     def _report(self, run: "_Run", seconds: dict[str, float], check: Check | None) -> Report:
         assert run.solved is not None
         recipe = run.done.recipe
         diagnostics = run.solved.diagnostics
-        dark = not run.solved.frame.mean_dn > 0 or diagnostics.noise_dn == 0
+        dark = not run.solved.has_light
         quality = run.solved.quality
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
         psf_scale = self._psf_scale(run.eye)
@@ -620,35 +703,26 @@ def _checked_match(figures: Consistency | None, quality: dict[str, float | None]
     return figures.match
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """The last frame that a solver has solved, and its diagnostics."""
-
-    frame: Linear
-    diagnostics: Diagnostics
-
-    @property
-    def quality(self) -> dict[str, float | None]:
-        """Figures of the frame and of the solver by their names in a report."""
-        figures = {"saturated": self.frame.saturated, "missing": self.frame.missing, "mean_dn": self.frame.mean_dn}
-        return {**figures, **self.diagnostics.quality}
-
-
 class _Run:
-    """State of the reconstruction of one frame."""
+    """State of the reconstruction of one frame; FrameError for another shape than the sensor."""
 
     def __init__(
         self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
     ) -> None:
+        check_image_shape(counts.shape)
+        if counts.shape[:2] != owner.shape:
+            raise FrameError(
+                f"the frame has {counts.shape[:2]} pixels, the calibration {owner.shape}", "Use the head's own PSF."
+            )
         self.clock = owner.clock
         self.counts = counts
         self.dark = dark
         self._defects = owner.defects
-        self._found: dict[int, Places | None] = {}
+        self.found: dict[int, Places | None] = {}
         self.deadline = deadline
         self.most = most
         self.done: _Stage = owner.stages[0]
-        self.solved: _Solved | None = None  # None before the first stage
+        self.solved: Solved | None = None  # None before the first stage
         self.rounds_done = 0
         self.stopped = "done"
         self.refraction: Refraction | NoRefraction | None = None
@@ -676,15 +750,22 @@ class _Run:
         """Return counts, dark frame (or None) and defective pixels of channel `c`; defects are searched only once."""
         counts = plane(self.counts, c)
         dark = None if self.dark is None else plane(self.dark, c)
-        if c not in self._found:
-            self._found[c] = self._defects(counts, dark)
-        return counts, dark, self._found[c]
+        if c not in self.found:
+            self.found[c] = self._defects(counts, dark)
+        return counts, dark, self.found[c]
 
     @property
     def known_defects(self) -> Places | None:
         """Flat indices of the pixels that are defective in at least one solved channel; None if there are none."""
-        found = [places for places in self._found.values() if places is not None]
+        found = [places for places in self.found.values() if places is not None]
         return np.unique(np.concatenate(found)) if found else None
+
+    def begin_with(self, stage: _Stage, look: QuickLook) -> None:
+        """Take over the first stage of this frame, solved before."""
+        stage.planes = look.planes.copy()
+        self.found = dict(look.defects)
+        self.done = stage
+        self.solved = look.solved
 
     def has_time_for(self, stage: _Stage) -> bool:
         """Return whether a stage runs: the first one always, a later one if there is time; else record the reason."""
@@ -728,8 +809,10 @@ class _Run:
             if pauses:
                 yield ROUND_DONE
                 now_s = self._resume(now_s)
+        begin_s = self.clock.now_s()
         stage.solver.finish(stage.planes[c])
-        self.solved = _Solved(frame, stage.solver.diagnostics)
+        stage.end_cost.add(self.clock.now_s() - begin_s)
+        self.solved = Solved(frame, stage.solver.diagnostics)
 
     def _resume(self, paused_s: float) -> float:
         """Move the deadline by the duration of a pause that began at `paused_s`, and return the present time."""
@@ -743,8 +826,10 @@ class _Run:
         """Return True if one more round fits, with time for the remaining channels (as many rounds) and the finish."""
         if self.deadline is None:
             return True
-        others_s = (channels_left - 1) * (stage.start_cost.seconds + (self.rounds_done + 1) * stage.round_cost.seconds)
-        return self.deadline.fits(stage.round_cost.seconds + others_s + stage.finish_cost.seconds)
+        rounds_s = (self.rounds_done + 1) * stage.round_cost.seconds
+        others_s = (channels_left - 1) * (stage.start_cost.seconds + rounds_s + stage.end_cost.seconds)
+        ends_s = stage.end_cost.seconds + stage.finish_cost.seconds
+        return self.deadline.fits(stage.round_cost.seconds + others_s + ends_s)
 
 
 def noise_frame(calibration: Calibration, shape: tuple[int, int]) -> Pixels:

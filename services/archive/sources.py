@@ -178,7 +178,7 @@ def _stored(store: Path, place: Path, calibrations: Mapping[str, Path], unusable
 
 def _stored_frames(place: Path, digests: Mapping[str, str], report: CaptureReport) -> tuple[FoundFrame, ...]:
     """Return the further frames of a stored capture, with the reasons why its report leaves some of them out."""
-    from services.instrument.capture import FRAME_QUALITY  # deferred: imports SQLAlchemy
+    from services.instrument.frame_preparation import FRAME_QUALITY  # deferred: imports SQLAlchemy
 
     uses = report.frames
     reasons = {use.index: use.reason for use in uses if use.reason and use.reason.startswith(FRAME_QUALITY)}

@@ -25,7 +25,6 @@ from services.records.idempotent_requests import key_conflict
 
 REMEMBERED = 32  # idempotency keys: a request that the network repeats makes one capture
 THUMBNAIL_PX = 640  # also of a quick look
-FRAME_QUALITY = "frame quality"  # begins the reason of a frame that its own verdict keeps out of the picture
 
 
 @dataclass(frozen=True)

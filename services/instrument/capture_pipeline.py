@@ -23,7 +23,7 @@ from device.recon.colour_reconstructor import ColourReconstruction, ColourRecons
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
-from device.recon.reconstructor import Reconstructor, Step, default_schedule
+from device.recon.reconstructor import EyePsf, Reconstructor, Step, default_schedule
 from device.recon.white_balance import light_dn_per_s
 from device.values import (
     EYES,
@@ -39,12 +39,13 @@ from device.values import (
     Verdict,
 )
 from services.imaging import picture_files
-from services.instrument.capture import FRAME_QUALITY, ExposedCapture, capture_files, capture_report
+from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
-from services.instrument.frame_preparation import FramePreparation, Looked
+from services.instrument.frame_preparation import FramePreparation, Looked, ranked
 from services.instrument.press_exposure import Exposure, LiveFrame, Taken, expose_press
+from services.instrument.time_budget import has_time_for_cylinder, is_of_one_frame
 from services.records.blobs import FileContent
-from services.records.capture import NO_METHOD, Capture, RecordOrigin
+from services.records.capture import BUDGET_S, NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import OTHER_COLOURS
 
 log = logging.getLogger(__name__)
@@ -92,7 +93,7 @@ class CapturePipeline:
         split: ExposureSplit = WHOLE,
         colours: Sequence[Colour] = (),
         field: str | None = None,
-        refract: bool = True,
+        budget_s: float = BUDGET_S,
         taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
         looked: Looked = lambda picture, simulated: None,
     ) -> Exposure:
@@ -100,7 +101,7 @@ class CapturePipeline:
 
         A pipeline of bursts prepares each lit frame while the next one is exposed, and splits the exposures as `split`
         says. `looked` is called in the thread of the preparation, with the quick look of the first useful frame, whose
-        refraction is estimated meanwhile with `refract`.
+        refraction and cylinder are estimated meanwhile, if the time budget leaves time for them.
         """
         able = [] if self.colours is None else [other for other in colours if other in self.colours.others]
         run = partial(
@@ -117,15 +118,23 @@ class CapturePipeline:
             exposure = run(taken=taken)
         else:
             colour = self._head.spec.light.colour
-            begin_s = self._clock.now_s()
-            with FramePreparation(self._feedback, self.bursts, colour, begin_s, looked, refract) as preparation:
+            with FramePreparation(
+                self._feedback,
+                self.bursts,
+                colour,
+                self._clock.now_s(),
+                looked,
+                refract=not is_of_one_frame(budget_s),
+                cylinder=has_time_for_cylinder(budget_s),
+                alone=self.exposures(count) * split.parts == 1,
+            ) as preparation:
 
                 def read_out(frame: Frame, dose_j_per_cm2: float, exposed_s: float) -> None:
                     taken(frame, dose_j_per_cm2, exposed_s)
                     preparation.add(frame)
 
-                exposure = run(split=split, taken=read_out)
-                exposure = replace(exposure, ready=preparation.finish())
+                exposure = run(split=split, taken=read_out, lit_taken=preparation.join)
+                exposure = replace(exposure, ready=preparation.finish(), burst=preparation.joined)
         return replace(exposure, missing=(*self._unable(colours), *exposure.missing))
 
     def exposures(self, count: int) -> int:
@@ -162,22 +171,13 @@ class CapturePipeline:
         return tuple(without_psf(colour) for colour in colours if colour not in able)
 
     def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
-        """Return the exposure with its first good frame at the front, and the verdict on that frame.
-
-        Without a good frame the order stays, and the verdict is that on the first one. Frames with another verdict than
-        the one then at the front are marked as unusable.
-        """
+        """Return the exposure with its frames as `ranked`, and the verdict on the first one."""
         verdicts = [self._verdict(frame, exposure) for frame in exposure.lit]
-        best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
+        order, unusable = ranked(verdicts)
+        best = order[0]
         light_e_per_um2 = verdicts[best].numbers.get("light_e_per_um2")
         if verdicts[best].word == "good" and light_e_per_um2 is not None and exposure.overhead_s is not None:
             self._known = PressLight(light_e_per_um2 / exposure.lit[best].exposure_s, exposure.overhead_s)
-        order = [best, *(k for k in range(len(verdicts)) if k != best)]
-        unusable = {
-            place: f"{FRAME_QUALITY}: {verdicts[k].code}"
-            for place, k in enumerate(order)
-            if verdicts[k].code != verdicts[best].code
-        }
         return replace(exposure, lit=tuple(exposure.lit[k] for k in order), unusable=unusable), verdicts[best]
 
     def _verdict(self, frame: Frame, exposure: Exposure) -> Verdict:
@@ -192,7 +192,7 @@ class CapturePipeline:
         FrameError if the frame cannot be reconstructed.
         """
         if (prepared := shot.exposure.prepared.get(0)) is not None:
-            return prepared.look.picture
+            return prepared.look.stage.picture
         made = self.reconstructor(shot.frame.counts, shot.exposure.dark_counts, quick=True)
         return crop_to_field(made.picture, self._head)
 
@@ -226,6 +226,8 @@ class CapturePipeline:
                 deadline=of_green,
                 unusable=exposure.unusable,
                 prepared=exposure.prepared,
+                joined=exposure.joined,
+                eye_psf=EyePsf.STORED if is_of_one_frame(shot.budget_s) else EyePsf.ESTIMATED,
             )
         if self.colours is None or not (exposure.colours or exposure.missing):
             return green

@@ -34,7 +34,7 @@ from services.instrument.live_pictures import LivePictures
 from services.instrument.press_exposure import Exposure, colours_of_lamp
 from services.instrument.resumption import ResumedPress, resumed_frames
 from services.instrument.shutter_button import ShutterButton
-from services.instrument.time_budget import is_of_one_frame, within_budget
+from services.instrument.time_budget import within_budget
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
@@ -170,7 +170,7 @@ class ExamLoop:
             split=split,
             colours=colours,
             field=target.field,
-            refract=not is_of_one_frame(budget_s),
+            budget_s=budget_s,
             taken=FrameSink(writer, shared, head.spec.light.colour),
             looked=partial(self._events.quick_look, press, id, is_exposing=True),
         )

@@ -14,9 +14,10 @@ from device.head import Head
 from device.light_safety.burst import burst, require_lit
 from device.optics.matrix import lamps_of
 from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
+from device.recon.burst import JoinedFrame
 from device.recon.burst_reconstructor import PreparedFrame
 from device.values import ChannelUse, Colour, Counts, ExposureSettings, Eye, Frame, Illumination
-from services.instrument.frame_preparation import AssessedFrame
+from services.instrument.frame_preparation import AssessedFrame, JoinedBurst
 from services.records.capture import OtherColour
 
 log = logging.getLogger(__name__)
@@ -32,7 +33,8 @@ class Exposure:
     exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
     picture, by its index; `missing` each other colour that was not taken, with the reason; `split` how the exposures of
     the lit frames were split; `overhead_s` what a lit frame took longer than its exposure, at most, None if this run
-    did not expose it; `ready` what was prepared of the frames during the exposure, by their numbers.
+    did not expose it; `ready` what was prepared of the frames during the exposure, by their numbers;
+    `burst` the frames as joined during the exposure.
     """
 
     lit: tuple[Frame, ...]
@@ -46,6 +48,7 @@ class Exposure:
     split: ExposureSplit = WHOLE
     overhead_s: float | None = None
     ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
+    burst: JoinedBurst | None = None
 
     @property
     def read_out_s(self) -> float:
@@ -62,6 +65,12 @@ class Exposure:
         """What was prepared of the lit frames, by their index; without useless ones."""
         found = {k: self.ready.get(frame.number) for k, frame in enumerate(self.lit)}
         return {k: frame.prepared for k, frame in found.items() if frame is not None and frame.prepared is not None}
+
+    @property
+    def joined(self) -> JoinedFrame | None:
+        """The lit frames as joined during the exposure, if they are still in that order."""
+        order = tuple(frame.number for frame in self.lit)
+        return self.burst.frame if self.burst is not None and self.burst.order == order else None
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,7 @@ def expose_press(
     field: str | None = None,
     taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
     split: ExposureSplit = WHOLE,
+    lit_taken: Callable[[], None] = lambda: None,
 ) -> Exposure:
     """Return a dark frame, the frames of up to `count` lit exposures, and one in each of `colours`, in this order.
 
@@ -92,7 +102,7 @@ def expose_press(
     up to a lower limit. There are fewer lit frames if the guard permits no light for so long. A colour that cannot be
     taken is missing, with the reason; the lit frames are kept. `field`: field of view of the programme, to which a
     simulated eye turns. `taken` is called with each frame after its read-out and must return at once: the lamp may be
-    on.
+    on. So must `lit_taken`, which is called after the last lit frame.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not or
     cannot be on, LightCut if the guard has ended the first lit frame, CameraMissing or CameraStalled if the camera
@@ -108,6 +118,7 @@ def expose_press(
         run.report(dark)
         lit = run.lit(Illumination(head.spec.light.colour), part, count, split.parts)
         overhead_s = run.overhead_s  # of the lit frames
+        lit_taken()
         others, missing = run.colours(colours)
         return Exposure(
             lit,

@@ -15,6 +15,7 @@ from services.records.capture_target import CaptureTarget
 
 Pace = Literal["grey", "quick", "standard"]
 PACES_S: dict[Pace, float] = {"grey": 0.26, "quick": 1.0, "standard": BUDGET_S}  # 0.26: the paper's
+CYLINDER_S = 2.0  # below it the cylinder of the refraction is not estimated: half a second of a second core
 ONE_FRAME_S = 0.5  # below it a press takes one lit frame, in green, and its refraction is not estimated
 MAX_IN_PROGRESS = 2  # captures in progress at once: one in refinement, and one more that is exposed
 MAX_STORAGE_S = 25.0  # longest storage of a capture: a worn card
@@ -26,6 +27,11 @@ SHUTDOWN_TIMEOUT_S = MAX_IN_PROGRESS * (
 def is_of_one_frame(budget_s: float) -> bool:
     """Return whether a press with this time budget takes one lit frame."""
     return budget_s < ONE_FRAME_S
+
+
+def has_time_for_cylinder(budget_s: float) -> bool:
+    """Return whether a press with this time budget estimates the cylinder of the refraction."""
+    return budget_s >= CYLINDER_S
 
 
 def within_budget(target: CaptureTarget, budget_s: float) -> CaptureTarget:

@@ -17,10 +17,10 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import EyePsf, Recipe, Reconstructor
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import Calibration, Counts, Image, Psf
+from device.values import Calibration, Counts, Image, Psf, Reconstruction
 from tests.simulated import coarse, with_keys
 from tests.simulated import world as decided
 
@@ -101,6 +101,19 @@ def test_an_eye_out_of_focus_is_reconstructed_as_well_as_a_relaxed_one(reconstru
     assert made.report.refraction_dpt is None
     assert 0.88 * focused[1] < pcc(made.picture, plain.calibration) < 0.99 * focused[1]
     assert np.array_equal(plain(counts_of(0.0)).picture, reconstruct(counts_of(0.0)).picture)
+
+
+def test_a_picture_with_the_stored_psf_is_not_that_with_the_psf_of_the_eye_before(reconstruct: Reconstructor) -> None:
+    before = reconstruct(counts_of(0.0))
+    assert before.report.refraction_dpt is not None
+    reconstruct(counts_of(4.0))
+    *_, made = reconstruct.steps(counts_of(4.0), eye_psf=EyePsf.STORED)
+    assert isinstance(made, Reconstruction)
+    assert (made.report.psf_scale, made.report.refraction_dpt) == (1.0, None)
+    plain = Reconstructor(
+        reconstruct.calibration, reconstruct.shape, PLANNER, VirtualClock(), (Recipe("gradient", 2),), refract=False
+    )
+    assert np.array_equal(made.picture, plain(counts_of(4.0)).picture)
 
 
 @pytest.fixture(scope="module")

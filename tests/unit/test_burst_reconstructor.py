@@ -83,6 +83,28 @@ def test_frames_prepared_during_the_exposure_give_the_same_picture(bursts: Burst
     assert made.report.quality == apart.report.quality
 
 
+def test_frames_joined_during_the_exposure_give_the_same_picture(bursts: BurstReconstructor, frames: list) -> None:
+    ready = {k: bursts.prepare(counts, refract=k == 0) for k, counts in enumerate(frames)}
+    joined = bursts.join(frames, None, {}, ready)
+    *_, made = bursts.steps(frames, simulated=True, prepared=ready, joined=joined)
+    apart = picture(bursts, frames)
+    assert isinstance(made, Reconstruction)
+    assert np.array_equal(made.picture, apart.picture)
+    assert made.report.frames == apart.report.frames
+    assert made.report.quality == apart.report.quality
+
+
+def test_a_frame_prepared_alone_gives_the_same_picture(bursts: BurstReconstructor, frames: list) -> None:
+    ready = bursts.prepare(frames[0], alone=True)
+    look, *_, made = bursts.steps(frames[:1], simulated=True, prepared={0: ready})
+    apart = picture(bursts, frames[:1])
+    assert look is ready.look.stage
+    assert isinstance(made, Reconstruction)
+    assert np.array_equal(made.picture, apart.picture)
+    with pytest.raises(FrameError, match="no signal"):
+        bursts.prepare(np.full(SHAPE, 64, np.uint16), alone=True)
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_fewer_frames_than_planned_have_the_noise_of_fewer(
     bursts: BurstReconstructor, frames: list, count: int

@@ -213,7 +213,7 @@ class RedOnly(NoColours):
 class NoBursts:
     """Reconstruction of bursts, which is not reached; no frame can be prepared."""
 
-    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
+    def prepare(self, counts: Pixels, dark: Pixels | None = None, **options: bool) -> PreparedFrame:
         raise FrameError("nothing is prepared here")
 
     def steps(self, frames: Sequence[Pixels], *_: object, **__: object) -> Iterator[Step]:

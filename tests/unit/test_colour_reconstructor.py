@@ -99,7 +99,8 @@ def test_no_budget_is_too_short_for_a_colour(bench: Bench, budget_s: float) -> N
 def test_green_leaves_the_colours_their_time_and_has_half_of_it(bench: Bench) -> None:
     clock = VirtualClock()
     first = bench.red.stages[0]
-    least_s = first.start_cost.seconds + first.finish_cost.seconds + bench.colours.join_cost.seconds
+    ends_s = first.end_cost.seconds + first.finish_cost.seconds
+    least_s = first.start_cost.seconds + ends_s + bench.colours.join_cost.seconds
     assert least_s > 0
     for budget_s in (4 * least_s, least_s):
         deadline = Deadline.after(clock, budget_s)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyfftw
@@ -14,7 +15,8 @@ from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import Grid
 from device.recon.reconstructor import Recipe, Reconstructor, RoundDone, StageResult
-from device.values import Reconstruction
+from device.recon.solvers.solver import Solver
+from device.values import Image, Reconstruction
 from tests import scenes
 
 SHAPE = (96, 128)
@@ -59,6 +61,54 @@ def test_a_pause_after_a_round_moves_the_deadline_and_admits_a_quick_look() -> N
     assert pauses > 3
     assert step.report.seconds["solve"] == pytest.approx(0.0)
     assert np.array_equal(step.picture, alone.picture)
+
+
+def test_a_quick_look_made_before_is_the_first_stage_of_its_frame() -> None:
+    reconstruct = scenes.reconstructor(scenes.calibration(scenes.speckle(SHAPE)), SHAPE, QUICK, FULL)
+    alone = reconstruct(counts())
+    look = reconstruct.quick_look(counts())
+    reconstruct.quick_look(counts(1))  # of another frame meanwhile
+    first, *_, made = reconstruct.steps(counts(), look=look)
+    assert first is look.stage
+    assert isinstance(made, Reconstruction)
+    assert np.array_equal(made.picture, alone.picture)
+    assert made.report.quality == alone.report.quality
+    late = reconstruct.steps(counts(), look=look, deadline=Deadline(VirtualClock(), -1.0))
+    *_, coarse = late
+    assert isinstance(coarse, Reconstruction)
+    assert np.array_equal(coarse.picture, reconstruct(counts(), quick=True).picture)
+
+
+class SlowEnd:
+    """Solver whose rounds take 50 ms on a virtual clock, and whose end takes 0.3 s."""
+
+    def __init__(self, solver: Solver, clock: VirtualClock) -> None:
+        self._solver, self._clock = solver, clock
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solver, name)
+
+    def step(self) -> None:
+        self._clock.sleep(0.05)
+        self._solver.step()
+
+    def finish(self, out: Image) -> None:
+        self._clock.sleep(0.3)
+        self._solver.finish(out)
+
+
+def test_the_deadline_reserves_the_end_of_the_solver() -> None:
+    clock = VirtualClock()
+    cal = scenes.calibration(scenes.speckle(SHAPE))
+    reconstruct = Reconstructor(cal, SHAPE, scenes.PLANNER, clock, (QUICK, Recipe("variation", 1, 30)))
+    stage = reconstruct.stages[1]
+    stage.solver = SlowEnd(stage.solver, clock)
+    reconstruct(counts())  # measures the cost of its end
+    begin_s = clock.now_s()
+    made = reconstruct(counts(), deadline=Deadline.after(clock, 1.0))
+    assert made.report.stopped == "deadline"
+    assert made.report.rounds > 5
+    assert clock.now_s() - begin_s <= 1.0
 
 
 def test_a_single_stage_has_no_pauses() -> None:
