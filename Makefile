@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers channel readme results effects parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -112,6 +112,10 @@ INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibr
 	$(addprefix tests/unit/,test_calibration_sequence.py test_calibration_measurements.py test_head_check.py test_trial_lenses.py \
 	test_damaged_rows.py test_montage.py test_backup.py test_effects.py test_scene_files.py \
 	test_paper_report.py)
+# Minutes each: 1,250 damages, of which `make test` has a sample; an optic that no head has; the maker's chart; guided
+# calibrations, updates and hasty fingers on the page, whose server side `make test-faults` tries.
+LONG := $(addprefix tests/,hard/test_store_damage.py physics/test_lenslets.py unit/test_model_eye.py \
+	browser/test_calibration_wizard.py browser/test_software_update.py browser/test_capture_edge_cases.py)
 NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
 # Workers take file after file in the order given: what takes long comes first, so that no worker begins it when the
 # others end. pytest drops a file that is named beside its folder, so that each is named once.
@@ -121,21 +125,24 @@ WORKERS := -n 3 $(IN_ORDER)
 # A test of the page waits for the page's debounce, for fades and for the browser's start.
 PAGE_WORKERS := -n 4 $(IN_ORDER)
 LONG_FAULTS := $(addprefix tests/,hard/test_press_and_command.py property/test_simulated_mark.py) $(INSTRUMENT_FAULTS)
-LONG_PAGES := $(addprefix tests/browser/,test_calibration_wizard.py test_software_update.py test_visit.py test_viewer.py test_page_states.py)
+LONG_PAGES := $(addprefix tests/browser/,test_visit.py test_viewer.py test_page_states.py)
 LONG_GOLDEN := $(addprefix tests/golden/,test_golden_http.py test_golden_files.py test_golden_cli.py test_golden_exam.py)
 tests_of = $(wildcard $(addsuffix /test_*.py,$(1)))
 
 test: .venv/kernels browser ## Run the tests that a change needs first: units, instrument, server, a press on the page.
-	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) $(filter-out $(INSTRUMENT_FAULTS),$(call tests_of,tests/journey tests tests/unit))
+	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) $(filter-out $(INSTRUMENT_FAULTS) $(LONG),$(call tests_of,tests/journey tests tests/unit))
 
 test-ports: .venv/kernels buses ## Run the contract suites of drivers and simulated parts on emulated buses.
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
 test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, faults of every part, optics and invariants.
-	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(LONG_FAULTS) $(filter-out $(LONG_FAULTS),$(call tests_of,$(FAULTS)))
+	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(LONG_FAULTS) $(filter-out $(LONG_FAULTS) $(LONG),$(call tests_of,$(FAULTS)))
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
-	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR $(LONG_PAGES) $(filter-out $(LONG_PAGES) $(JOURNEYS),$(call tests_of,tests/browser))
+	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR $(LONG_PAGES) $(filter-out $(LONG_PAGES) $(LONG) $(JOURNEYS),$(call tests_of,tests/browser))
+
+test-long: .venv/kernels browser strace ## Try 1,250 damages of a store, lenslets, the maker's chart, guided calibrations and updates on the page.
+	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(LONG)
 
 page-pictures: .venv/ready browser ## Take README's two pictures of the page again, on the real server with the simulated head.
 	@$(BIN)/python -m tests.browser.readme_pictures
@@ -302,6 +309,9 @@ channel: .venv/ready ## Serve an update channel with a signed test bundle, and t
 
 effects: .venv/ready ## Simulate two scenes with the effects that each calls for and with all: time, difference, picture.
 	@$(BIN)/python -m tests.bench.effects out/effects.png
+
+frontier: .venv/ready ## Measure what accuracy costs in time on this idle computer: README's plot, and the page's before its own.
+	@$(BIN)/python -m tests.bench.frontier
 
 results: .venv/ready ## Run the paper's experiments and write tests/paper/results.md with its pictures; ten minutes.
 	@$(BIN)/diffuscope paper -o out/paper --page tests/paper/results.md
