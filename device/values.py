@@ -113,11 +113,24 @@ class ExposureSettings:
 
 
 @dataclass(frozen=True)
+class SimulatedEffects:
+    """Effects that the simulator put into a picture."""
+
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = DESCRIBED
+
+    names: tuple[str, ...]
+    """Names of these effects, in the order of the light path."""
+
+    known: Whole
+    """Number of effects that the simulator knows: the others would have changed nothing that can be seen."""
+
+
+@dataclass(frozen=True)
 class Frame:
     """Raw sensor frame: uint16 counts, (rows, cols) or (rows, cols, 3), in DN, with its exposure time and number.
 
     `illumination` is the light during the exposure (None: not lit throughout). `simulated` marks a frame that shows no
-    real eye; it must be copied to every result. FrameError for other counts.
+    real eye; it must be copied to every result. `effects`: what the simulator put into it. FrameError for other counts.
     """
 
     counts: Counts
@@ -125,6 +138,7 @@ class Frame:
     number: int
     illumination: Illumination | None
     simulated: bool
+    effects: SimulatedEffects | None = None
 
     def __post_init__(self) -> None:
         check_image_shape(self.counts.shape)

@@ -238,7 +238,7 @@ class RecordRemoved(StoreError):
 
 
 class RecordNotFound(StoreError, LookupError):
-    """There is no capture, visit or picture slot with this id."""
+    """There is no capture, visit or picture slot with this id, or no measurement yet."""
 
     code = "store.unknown"
     default_remedy = "Choose a picture from the list."

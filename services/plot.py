@@ -81,9 +81,10 @@ class Axis:
 
 @dataclass(frozen=True)
 class Plot:
-    """Content of one plot; `edge`: points (x, y) of the Pareto front; `limit`: x and label of a vertical line.
+    """Content of one plot; `edge`: points (x, y) of the Pareto front; `limits`: x and label of vertical lines.
 
-    `ring`: x, y and label of a circle. `right`: y values and labels of ticks at the right. Width and height are in px.
+    `rings`: x, y and label of circles; the legend has the label of the first one. `right`: y values and labels of ticks
+    at the right. Width and height are in px.
     """
 
     title: str
@@ -93,8 +94,8 @@ class Plot:
     y: Axis
     series: tuple[Series, ...]
     edge: tuple[tuple[float, float], ...] = ()
-    limit: tuple[float, str] | None = None
-    ring: tuple[float, float, str] | None = None
+    limits: tuple[tuple[float, str], ...] = ()
+    rings: tuple[tuple[float, float, str], ...] = ()
     right: tuple[tuple[float, str], ...] = ()
     right_title: str = ""
     width: int = field(default=960, kw_only=True)
@@ -187,7 +188,7 @@ def document(
 
 
 def _elements(plot: Plot) -> list[str]:
-    inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot)]
+    inner = [*_frame(plot), *_edge(plot), *_limits(plot), *_series(plot), *_rings(plot), *_legend(plot)]
     heads = [text(LEFT, 32, plot.title, "title"), text(LEFT, 54, plot.subtitle, "quiet small")]
     return [*heads, *inner, *_labels(plot)]
 
@@ -258,14 +259,20 @@ def _edge(plot: Plot) -> list[str]:
     return [f'<path class="edge" d="{" ".join(path)}"><title>Pareto edge: the best within each time</title></path>']
 
 
-def _limit(plot: Plot) -> list[str]:
-    if plot.limit is None or not plot.x.low < plot.limit[0] < plot.x.high:
-        return []
-    at = _x(plot, plot.limit[0])
-    return [
-        line(at, TOP, at, plot.height - BOTTOM, "limit"),
-        text(at + 6, plot.height - BOTTOM - 8, plot.limit[1], "small limit-word"),
-    ]
+def _limits(plot: Plot) -> list[str]:
+    out = []
+    for value, words in plot.limits:
+        if plot.x.low < value < plot.x.high:
+            out.append(line(_x(plot, value), TOP, _x(plot, value), plot.height - BOTTOM, "limit"))
+            out.append(text(_limit_label_px(plot, value, words), plot.height - BOTTOM - 8, words, "small limit-word"))
+    return out
+
+
+def _limit_label_px(plot: Plot, value: float, words: str) -> float:
+    """Return where the label of a limit begins: right of its line, left of it where the frame ends."""
+    at = _x(plot, value)
+    wide = LETTER_PX * len(words)
+    return at + 6 if at + 6 + wide < plot.width - RIGHT else at - 6 - wide
 
 
 def _by_kind(plot: Plot) -> list[tuple[int, Series]]:
@@ -318,12 +325,12 @@ def _shape(k: int, x: float, y: float, r: float, hollow: bool = False) -> str:
     return f'<path class="mark"{style} d="M {places} Z">'
 
 
-def _ring(plot: Plot) -> list[str]:
-    if plot.ring is None:
-        return []
-    x, y, words = plot.ring
-    ring = f'<circle class="ring" cx="{_x(plot, x):.1f}" cy="{_y(plot, y):.1f}" r="13">'
-    return [f"{ring}<title>{escape(words)}</title></circle>"]
+def _rings(plot: Plot) -> list[str]:
+    return [
+        f'<circle class="ring" cx="{_x(plot, x):.1f}" cy="{_y(plot, y):.1f}" r="13">'
+        f"<title>{escape(words)}</title></circle>"
+        for x, y, words in plot.rings
+    ]
 
 
 def _legend(plot: Plot) -> list[str]:
@@ -341,10 +348,10 @@ def _legend(plot: Plot) -> list[str]:
     if plot.edge:
         out += [line(at, TOP - 20, at + 24, TOP - 20, "edge"), text(at + 30, TOP - 16, "Pareto edge", "small")]
         at += 30 + LETTER_PX * 11 + 12
-    if plot.ring is not None:
+    if plot.rings:
         out += [
             f'<circle class="ring" cx="{at + 8:.1f}" cy="{TOP - 20}" r="8"/>',
-            text(at + 22, TOP - 16, plot.ring[2], "small"),
+            text(at + 22, TOP - 16, plot.rings[0][2], "small"),
         ]
     return out
 
@@ -357,14 +364,16 @@ def _labels(plot: Plot) -> list[str]:
     taken: list[Box] = [
         (_x(plot, m.x) - 6, _y(plot, m.y) - 6, _x(plot, m.x) + 6, _y(plot, m.y) + 6) for m in _marks(plot)
     ]
-    if plot.ring is not None:
-        x = _x(plot, plot.ring[0])
-        y = _y(plot, plot.ring[1])
+    for value, level, _ in plot.rings:
+        x = _x(plot, value)
+        y = _y(plot, level)
         taken.append((x - 13, y - 13, x + 13, y + 13))
-    if plot.limit is not None:
-        x = _x(plot, plot.limit[0])
+    for value, words in plot.limits:
+        left = _limit_label_px(plot, value, words)
+        x = _x(plot, value)
         y = plot.height - BOTTOM - 8
-        taken.append((x - GAP_PX, y - LINE_PX, x + 6 + LETTER_PX * len(plot.limit[1]) + GAP_PX, y + GAP_PX))
+        ends = min(x, left) - GAP_PX, max(x, left + LETTER_PX * len(words)) + GAP_PX
+        taken.append((ends[0], y - LINE_PX, ends[1], y + GAP_PX))
     labelled = [(k, mark) for k, series in _by_kind(plot) for trail in series.trails for mark in trail if mark.label]
     out = []
     for k, mark in sorted(labelled, key=lambda entry: -entry[1].weight):

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.errors import CameraMissing, CameraStalled, FrameError
+from device.sim.plan import simulated_effects
 from device.sim.world import World
 from device.values import ExposureSettings, Frame
 
@@ -53,7 +54,7 @@ class SimCamera:
         world.lit_frames += world.illumination is not None
         if world.has_fault("camera.mode"):
             counts = counts[::2, ::2].copy()
-        return Frame(counts, shot.exposure_s, world.frames, world.illumination, simulated=True)
+        return Frame(counts, shot.exposure_s, world.frames, world.illumination, True, simulated_effects(world.plan))
 
     def prepare(self, shot: ExposureSettings) -> None:
         """Compute the light of the eye for frames of this length, not later while the lamp is lit."""

@@ -14,6 +14,7 @@ from device.sim.fundus import Fundus
 from device.sim.installed_effects import effects_of
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.sensor import SensorModel
+from device.values import SimulatedEffects
 
 ETA_THRESHOLD = 0.05
 
@@ -67,6 +68,11 @@ def build_setup(scene: Scene, subject: Fundus, decisions: Sequence[Decision]) ->
             with setup.timed(decision.name):
                 decision.effect.apply(setup)
     return setup
+
+
+def simulated_effects(decisions: Sequence[Decision]) -> SimulatedEffects:
+    """Return the names of the effects that are simulated, and the number of all."""
+    return SimulatedEffects(tuple(decision.name for decision in decisions if decision.simulated), len(decisions))
 
 
 def format_plan(decisions: Sequence[Decision], spent_ms: dict[str, float] | None = None) -> str:

@@ -31,6 +31,12 @@ class JpegResponse(Response):
     media_type = "image/jpeg"
 
 
+class SvgResponse(Response):
+    """A drawing as SVG."""
+
+    media_type = "image/svg+xml"
+
+
 class ZipResponse(Response):
     """A ZIP archive."""
 

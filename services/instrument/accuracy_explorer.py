@@ -1,7 +1,10 @@
 """Accuracy against computing time on this device: measurement, new reconstruction of captures, time budget.
 
     FOLDER/frontier.json    the last measurement (services/research/frontier.py)
+    FOLDER/frontier.svg     its plot
     FOLDER/choice.json      the selected time budget: grey, quick or standard
+
+Before a measurement the simulated head shows the one in `simulated_frontier/`, which `make frontier` writes.
 
 The module does not use the head: it simulates a scene with the same camera, and it reads stored captures.
 """
@@ -18,13 +21,14 @@ from pydantic import JsonValue, ValidationError
 from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.config.head_file import InstrumentSpec, load_head
+from device.config.shipped_heads import HEADS
 from device.errors import DiffuscopeError, SettingError
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Calibration
-from services.errors import Busy
+from services.errors import Busy, RecordNotFound
 from services.imaging import picture_files
 from services.instrument.background import run_in_subprocess
 from services.instrument.measured_frontier import MeasuredFrontier
@@ -34,9 +38,11 @@ log = logging.getLogger(__name__)
 
 SCENE = Path(__file__).parents[2] / "device" / "sim" / "scenes" / "diabetic.toml"
 BUDGET_S = 0.26  # the paper's time budget, marked in the plot
-REPEATS = 5
+REPEATS = 2  # timed turns of every point: a measurement takes about a minute
 LARGEST_BIN = 16
-Measure = Callable[[InstrumentSpec, Path, float, int, Callable[[str], None]], MeasuredFrontier]
+SHIPPED = Path(__file__).parent / "simulated_frontier"  # of the head below
+SHIPPED_HEAD = HEADS / "sim.toml"
+Measure = Callable[[InstrumentSpec, Path, float, int, Callable[[str], None]], tuple[MeasuredFrontier, str]]
 
 
 @dataclass(frozen=True)
@@ -53,11 +59,12 @@ class StoredCapture:
 class ExplorerState:
     """Last measurement (None before it), selected time budget, progress of a running computation, and last error.
 
-    `paces_s`: time budgets in seconds by name. `busy`: a computation is running, with the progress text `progress`.
-    `scene`: name of the simulated scene.
+    `shipped`: the measurement was made on another computer, which it names. `paces_s`: time budgets in seconds by name.
+    `busy`: a computation is running, with the progress text `progress`. `scene`: name of the simulated scene.
     """
 
     measured: MeasuredFrontier | None
+    shipped: bool
     pace: Pace
     paces_s: Mapping[Pace, float]
     busy: bool
@@ -85,6 +92,7 @@ class AccuracyExplorer:
         self.folder, self.plans, self.clock, self.publish = folder, plans, clock, publish
         self._measure_frontier = measure
         self._scene = simulated_head(spec, load_head(scene))
+        self._is_shipped_head = spec == load_head(SHIPPED_HEAD)
         self._busy = Lock()
         self._message = ""
         self._problem: DiffuscopeError | None = None
@@ -92,7 +100,7 @@ class AccuracyExplorer:
     @property
     def pace(self) -> Pace:
         """The selected time budget by name; `standard` without a selection."""
-        pace = self._read("choice.json").get("pace")
+        pace = _read_json(self.folder / "choice.json").get("pace")
         return next((name for name in PACES_S if name == pace), "standard")
 
     @property
@@ -103,13 +111,28 @@ class AccuracyExplorer:
     def choose(self, pace: Pace) -> None:
         """Select a time budget for the following captures, and log it."""
         log.info("time budget set to %g s (%s; before: %s)", PACES_S[pace], pace, self.pace)
-        self._write("choice.json", {"pace": pace})
+        _write(self.folder / "choice.json", json.dumps({"pace": pace}, indent=1))
 
     def state(self) -> ExplorerState:
         """Return the last measurement, the selected time budget, the progress and the last error."""
+        folder = self._measured_folder()
         return ExplorerState(
-            self._measured(), self.pace, PACES_S, self._busy.locked(), self._message, self._scene.name, self._problem
+            None if folder is None else _measured_in(folder),
+            folder == SHIPPED,
+            self.pace,
+            PACES_S,
+            self._busy.locked(),
+            self._message,
+            self._scene.name,
+            self._problem,
         )
+
+    def plot(self) -> str:
+        """Return the plot of the measurement as SVG; RecordNotFound before it."""
+        folder = self._measured_folder()
+        if folder is None:
+            raise RecordNotFound("accuracy against time is not measured on this device", "Measure it first.")
+        return (folder / "frontier.svg").read_text(encoding="utf-8")
 
     def measure(self) -> None:
         """Start the measurement of every method in a background thread and return; Busy during another computation."""
@@ -119,11 +142,10 @@ class AccuracyExplorer:
 
     def _run_measurement(self) -> None:
         try:
-            frontier = run_in_subprocess(
+            frontier, plot = run_in_subprocess(
                 self._measure_frontier, self._scene, self.plans, BUDGET_S, REPEATS, report=self._report
             )
-            measured = frontier.model_copy(update={"measured_at": self.clock.wall().isoformat()})
-            self._write("frontier.json", measured.model_dump(mode="json"))
+            write_measurement(self.folder, frontier, plot, self.clock)
         except DiffuscopeError as error:
             log.warning("measurement of accuracy against time failed: %s", error)
             self._problem = error
@@ -153,28 +175,43 @@ class AccuracyExplorer:
         self._message = message
         self.publish("accuracy", progress=message)
 
-    def _measured(self) -> MeasuredFrontier | None:
-        stored = self._read("frontier.json")
-        try:
-            return MeasuredFrontier.model_validate(stored) if stored else None
-        except ValidationError:
-            log.warning("%s is not a measurement; measure again", self.folder / "frontier.json")
-            return None
+    def _measured_folder(self) -> Path | None:
+        """Return the folder of the last measurement, else of the shipped one if it is of this head."""
+        if _measured_in(self.folder) is not None:
+            return self.folder
+        return SHIPPED if self._is_shipped_head else None
 
-    def _read(self, name: str) -> Mapping[str, JsonValue]:
-        path = self.folder / name
-        try:
-            read = json.loads(path.read_bytes())
-        except FileNotFoundError:
-            return {}
-        except ValueError:
-            log.warning("%s is not valid JSON; measure or choose again", path)
-            return {}
-        return read if isinstance(read, dict) else {}
 
-    def _write(self, name: str, content: Mapping[str, JsonValue]) -> None:
-        atomic_io.make_folder(self.folder)
-        atomic_io.write_atomically(self.folder / name, json.dumps(content, indent=1).encode())
+def write_measurement(folder: Path, frontier: MeasuredFrontier, plot: str, clock: Clock) -> None:
+    """Write a measurement with its plot (SVG) and the time of `clock` as the last one of a folder."""
+    measured = frontier.model_copy(update={"measured_at": clock.wall().isoformat()})
+    _write(folder / "frontier.svg", plot)
+    _write(folder / "frontier.json", json.dumps(measured.model_dump(mode="json"), indent=1))
+
+
+def _write(path: Path, content: str) -> None:
+    atomic_io.make_folder(path.parent)
+    atomic_io.write_atomically(path, content.encode())
+
+
+def _measured_in(folder: Path) -> MeasuredFrontier | None:
+    stored = _read_json(folder / "frontier.json")
+    try:
+        return MeasuredFrontier.model_validate(stored) if stored else None
+    except ValidationError:
+        log.warning("%s is not a measurement; measure again", folder / "frontier.json")
+        return None
+
+
+def _read_json(path: Path) -> Mapping[str, JsonValue]:
+    try:
+        read = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return {}
+    except ValueError:
+        log.warning("%s is not valid JSON; measure or choose again", path)
+        return {}
+    return read if isinstance(read, dict) else {}
 
 
 def simulated_head(spec: InstrumentSpec, scene: InstrumentSpec) -> InstrumentSpec:

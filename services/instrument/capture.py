@@ -211,5 +211,6 @@ def capture_report(
         budget_s=shot.budget_s,
         from_read_out_s=round(made_s - shot.exposure.read_out_s, 4),
         from_tap_s=None if tapped_s is None else round(made_s - tapped_s, 4),
+        effects=shot.frame.effects,
     )
     return CaptureReport.read(report.as_json())

@@ -9,7 +9,7 @@ from pydantic import computed_field, field_validator
 from pydantic.dataclasses import dataclass
 
 from device.light_safety.dose_report import DoseReport
-from device.values import OMITTED_IF_EMPTY, Eye, FrameUse, Number, Report, Verdict, Whole
+from device.values import OMITTED_IF_EMPTY, Eye, FrameUse, Number, Report, SimulatedEffects, Verdict, Whole
 from services.records.stored_record import CONFIG, StoredRecord
 
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
@@ -177,6 +177,9 @@ class ShownReport(StoredRecord, DoseReport, Report):
 
     from_tap_s: Number | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
     """Seconds from the arrival of the request to the final picture; only if the picture is of the same run."""
+
+    effects: SimulatedEffects | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
+    """Effects that the simulator put into the picture; only of a simulated head."""
 
     moved: tuple[EyeCorrection, ...] = dataclasses.field(default=(), metadata=OMITTED_IF_EMPTY)
     """Corrections of the eye, oldest first; only if there are any."""

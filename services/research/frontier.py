@@ -31,9 +31,9 @@ from device.sim.scene_files import simulate_exposure
 from device.values import Calibration, Image, Mask, Reconstruction
 from services.instrument.measured_frontier import MeasuredFrontier
 from services.plot import Panel
-from services.research.frontier_light import LightCase, light_case, measure_light
+from services.research.frontier_light import LightCase, light_case, measure_light, measure_presses
 from services.research.frontier_oracle import best_mus
-from services.research.frontier_plot import draw_frontier, drawn_points
+from services.research.frontier_plot import draw_frontier, drawn_points, ringed
 from services.research.frontier_result import (
     BestMu,
     Choice,
@@ -43,6 +43,7 @@ from services.research.frontier_result import (
     Machine,
     PeerPoint,
     Point,
+    PressPoint,
     ScoredRegion,
     frontier_text,
     pareto_front,
@@ -159,6 +160,8 @@ def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer
     case = bench.case
     for note in case.notes:
         bench.progress(f"note: {note}")
+    presses = bench.press_points()  # first: the arrays of 70 other solvers would slow them down
+    light = bench.light_points()
     points, choice = bench.measure(budget_s, repeats)
     front = pareto_front([(p.seconds_median, p.psnr_db) for p in points])
     points = tuple(replace(point, pareto=on) for point, on in zip(points, front, strict=True))
@@ -178,7 +181,8 @@ def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer
         choice=choice,
         dominated=tuple(method for method in bench.methods if method not in kept),
         peers=() if peer is None else bench.peer_points(peer),
-        light=bench.light_points(),
+        light=light,
+        presses=presses,
         left_out=tuple(bench.left_out),
     )
 
@@ -192,10 +196,16 @@ def scene_case(spec: InstrumentSpec, bursts: bool = False) -> Case:
 
 def measure_scene(
     spec: InstrumentSpec, plans: Path, budget_s: float, repeats: int, progress: ProgressCallback
-) -> MeasuredFrontier:
-    """Return the frontier of one simulated exposure of a head, as `measure_frontier` does."""
-    found = measure_frontier(scene_case(spec), plans, budget_s, repeats, progress)
-    return MeasuredFrontier.model_validate_json(frontier_text(found))
+) -> tuple[MeasuredFrontier, str]:
+    """Return the frontier of one simulated head with its bursts and presses, and its plot as SVG.
+
+    Without the method for an unknown field: a simulated head knows it.
+    """
+    methods = {name: method for name, method in METHODS.items() if name != "open"}
+    bench = _Bench(scene_case(spec, bursts=True), Planner(plans), SystemClock(), progress, methods)
+    found = _measured(bench, budget_s, repeats, None)
+    plot = draw_frontier(found, methods, bench.thumbnails(found))
+    return MeasuredFrontier.model_validate_json(frontier_text(found)), plot
 
 
 def table(found: Frontier) -> str:
@@ -222,6 +232,11 @@ def table(found: Frontier) -> str:
         f"{choice.rounds} rounds: {choice.psnr_db:.2f} dB in {choice.solve_s:.3f} s, "
         f"{choice.db_below_edge:.2f} dB below the edge; and {choice.refract_s:.3f} s for the eye's refraction"
     )
+    for press in found.presses:
+        lines.append(
+            f"  a press within {press.budget_s:g} s ({press.choice}, {press.frames} lit): {press.psnr_db:.2f} dB in "
+            f"{press.seconds_median:.3f} s"
+        )
     for peer in found.peers:
         lines.append(f"  {peer.name}: {peer.psnr_db:.2f} dB in {peer.seconds:.3f} s")
     for burst in found.light:
@@ -240,7 +255,7 @@ class _Bench:
     ) -> None:
         self.case, self.planner, self.clock, self.progress = case, planner, clock, progress
         self.methods = methods
-        self.chosen = np.zeros(case.shape, np.float32)
+        self.last: Shown | None = None  # thumbnail of the press, or of the choice
         geometry = case.calibration.geometry
         self.detail_px = HIGHPASS_DEG * geometry.px_per_deg if geometry else HIGHPASS_PX
         self.inside, self.where = scored_region(case)
@@ -327,20 +342,17 @@ class _Bench:
         )
 
     def thumbnails(self, found: Frontier) -> Panel:
-        """Return the thumbnails of the best pictures within some times and of the chosen one, after `measure`."""
-        choice = found.choice
+        """Return the thumbnails of the best pictures within some times and of the ring, after `measure`."""
+        assert self.last is not None
         shown = []
-        for p in nearest_points(drawn_points(found), choice.seconds_median):
+        for p in nearest_points(drawn_points(found), ringed(found)[-1].seconds_median):
             recipe = next(
                 candidate
                 for candidate in self.recipes
                 if (candidate.method, candidate.bin, candidate.rounds or 0) == (p.method, p.bin, p.rounds)
             )
-            lines = _label(p, self.methods)
-            shown.append(Shown(lines, self.moved(_grey(self._reconstruct(recipe).picture))))
-        lines = _label(choice, METHODS)  # the instrument chooses among the built-in methods
-        shown.append(Shown((lines[0], lines[1], f"{lines[2]}, chosen"), self.chosen))
-        return thumbnail_panel(shown, self.case.truth, self.inside, self.case.calibration.simulated)
+            shown.append(Shown(_label(p, self.methods), self.moved(_grey(self._reconstruct(recipe).picture))))
+        return thumbnail_panel([*shown, self.last], self.case.truth, self.inside, self.case.calibration.simulated)
 
     def light_points(self) -> tuple[LightPoint, ...]:
         """Return the bursts of the case; none if it has no frames for them."""
@@ -350,6 +362,18 @@ class _Bench:
         return measure_light(
             case.light, self.instrument, self.planner, self.clock, case.truth, self.judge, self.progress
         )
+
+    def press_points(self) -> tuple[PressPoint, ...]:
+        """Return what a press makes of the case within each time budget; none if it has no frames for it."""
+        case = self.case
+        if case.light is None:
+            return ()
+        points, picture = measure_presses(
+            case.light, self.instrument, self.planner, self.clock, self.judge, self.progress
+        )
+        lines = _label(points[-1], METHODS)
+        self.last = Shown((lines[0], lines[1], f"{points[-1].frames} frames, standard"), picture)
+        return points
 
     def peer_points(self, peer: LenslessPeer) -> tuple[PeerPoint, ...]:
         """Return the pictures of a peer, scored as ours are."""
@@ -370,7 +394,6 @@ class _Bench:
             for (recipe, rounds, scores), seconds in zip(scored, times, strict=True)
         )
         report = last.report
-        self.chosen = self.moved(_grey(last.picture))
         refract_s = float(np.median([each.report.seconds["refract"] for each in made]))
         solve_s = _summary(own)[0] - refract_s
         scores = self.score(last)
@@ -388,6 +411,9 @@ class _Bench:
             db_below_edge=max(0.0, *lead_db, 0.0),
             **asdict(scores),
         )
+        if self.last is None:
+            lines = _label(choice, METHODS)  # the instrument chooses among the built-in methods
+            self.last = Shown((lines[0], lines[1], f"{lines[2]}, chosen"), self.moved(_grey(last.picture)))
         return points, choice
 
     def _times(
@@ -428,7 +454,7 @@ def _summary(seconds: list[float]) -> tuple[float, float]:
     return float(np.median(seconds)), float(np.quantile(seconds, 0.95))
 
 
-def _label(made: Point | Choice, methods: Mapping[str, Method]) -> tuple[str, str, str]:
+def _label(made: Point | Choice | PressPoint, methods: Mapping[str, Method]) -> tuple[str, str, str]:
     """Return the lines below a thumbnail: time and accuracy, method and bin, rounds."""
     ms = made.seconds_median * 1e3
     rounds = f"{made.rounds} round{'' if made.rounds == 1 else 's'}" if methods[made.method].round_pairs else ""

@@ -1,5 +1,7 @@
 """Accuracy against light: bursts of one scene, their dose, and the bound of a linear filter with as much light.
 
+And what a press makes of one scene within each time budget.
+
 The bound is the Wiener filter that an oracle gives the object's own radial power, the noise and the even part of the
 picture, on a frame of a still eye behind exactly the calibrated PSF. A linear filter with less knowledge stays below
 it; total variation is not linear, and gets above it where the object has edges.
@@ -7,12 +9,12 @@ it; total variation is not linear, and gets above it where the object has edges.
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy import fft
 
-from device.clock import Clock, VirtualClock
+from device.clock import Clock, Deadline, VirtualClock
 from device.config.head_file import InstrumentSpec
 from device.head import hazard_of
 from device.recon.assessment.metrics import PictureScorer
@@ -20,12 +22,14 @@ from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc
-from device.recon.reconstructor import Reconstructor
+from device.recon.reconstructor import EyePsf, Reconstructor
 from device.sim.render import crop_or_pad
 from device.sim.scene_files import lit_frames
 from device.sim.world import World
 from device.values import Calibration, Counts, Illumination, Image, Reconstruction
-from services.research.frontier_result import LightPoint
+from services.instrument.time_budget import PACES_S, is_of_one_frame
+from services.records.capture_target import FRAMES
+from services.research.frontier_result import LightPoint, PressPoint
 
 NUMBERS = (1, 2, 4, 8)  # of frames
 REPEATS = 3
@@ -97,6 +101,58 @@ def measure_light(
         progress(f"{point.length}: {point.psnr_db:.2f} dB, linear bound {point.bound_psnr_db:.2f} dB")
         found.append(point)
     return tuple(found)
+
+
+def measure_presses(
+    case: LightCase,
+    instrument: Reconstructor,
+    planner: Planner,
+    clock: Clock,
+    judge: PictureScorer,
+    progress: ProgressCallback,
+) -> tuple[tuple[PressPoint, ...], Image]:
+    """Return what a press makes of its lit frames within each time budget, and the last picture; `judge` scores it.
+
+    As in a press, a burst is joined before the time begins, beside the exposure in red; a single frame is prepared
+    within the time.
+    """
+    burst = BurstReconstructor(instrument, planner)
+    found = []
+    for choice, budget_s in PACES_S.items():
+        alone = is_of_one_frame(budget_s)
+        frames = case.frames[: 1 if alone else FRAMES]
+        seconds = []
+        for _ in range(REPEATS):
+            prepared = {} if alone else {k: burst.prepare(frame, refract=k == 0) for k, frame in enumerate(frames)}
+            joined = None if alone else burst.join(frames, None, {}, prepared)
+            begin_s = clock.now_s()
+            steps = burst.steps(
+                frames,
+                simulated=True,
+                deadline=Deadline.after(clock, budget_s),
+                prepared=prepared or {0: burst.prepare(frames[0], alone=True)},
+                joined=joined,
+                eye_psf=EyePsf.STORED if alone else EyePsf.ESTIMATED,
+            )
+            (last,) = deque(steps, maxlen=1)
+            seconds.append(clock.now_s() - begin_s)
+            assert isinstance(last, Reconstruction)
+            made = last
+        scores = judge(made.picture)
+        point = PressPoint(
+            choice,
+            budget_s,
+            len(frames),
+            made.report.method,
+            made.report.bin,
+            made.report.rounds,
+            float(np.median(seconds)),
+            max(seconds) <= budget_s,
+            **asdict(scores),
+        )
+        progress(f"a press within {budget_s:g} s: {point.psnr_db:.2f} dB in {point.seconds_median:.2f} s")
+        found.append(point)
+    return tuple(found), made.picture
 
 
 def linear_bound(calibration: Calibration, mean_dn: float, n: int, truth: Image) -> Image:

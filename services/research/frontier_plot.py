@@ -6,7 +6,7 @@ from math import log10
 
 from device.recon.methods import METHODS, Method
 from services.plot import Mark, Panel, Plot, Series, log_axis, stacked_svg, time_axis, value_axis
-from services.research.frontier_result import Frontier, Point, pareto_front
+from services.research.frontier_result import Choice, Frontier, Point, PressPoint, pareto_front
 from services.research.frontier_thumbnails import LETTERS, nearest_points
 
 PEER_KIND, BURST_KIND, BOUND_KIND = 5, 6, 7  # of marks, the same in both plots
@@ -21,12 +21,17 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS, thum
     bursts were measured.
     """
     points = drawn_points(found)
-    shown = nearest_points(points, found.choice.seconds_median) if thumbnails else ()
+    shown = nearest_points(points, ringed(found)[-1].seconds_median) if thumbnails else ()
     letters = dict(zip((_key(p) for p in shown), LETTERS, strict=False))
     plots = [_time_plot(found, methods, points, letters)]
     if found.light:
         plots.append(_light_plot(found))
     return stacked_svg(plots, [thumbnails] if thumbnails else [])
+
+
+def ringed(found: Frontier) -> tuple[PressPoint, ...] | tuple[Choice]:
+    """Return the points with a ring: what a press does with each time budget; of a recorded frame the choice."""
+    return found.presses or (found.choice,)
 
 
 def drawn_points(found: Frontier) -> tuple[Point, ...]:
@@ -46,11 +51,13 @@ def _key(point: Point) -> tuple[str, int, int]:
 def _time_plot(
     found: Frontier, methods: Mapping[str, Method], points: Sequence[Point], letters: Mapping[tuple[str, int, int], str]
 ) -> Plot:
-    choice = found.choice
-    budget_s = found.budget_s
+    limits = tuple((press.budget_s, f"{press.choice} {press.budget_s:g} s") for press in found.presses) or (
+        (found.budget_s, f"budget {found.budget_s:g} s"),
+    )
     edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
     words = "" if found.light else " (rounds)"  # the legend has no room for it beside bursts and peers
     kinds = {name: kind for kind, name in enumerate(dict.fromkeys((*METHODS, *methods)))}  # the choice is built in
+    letter = LETTERS[len(letters)] if letters else ""
     series = (
         *_best_mus(found),
         *(
@@ -58,7 +65,7 @@ def _time_plot(
             for method in methods.values()
             if any(p.method == method.name for p in points)
         ),
-        _chosen(found, kinds[found.choice.method], LETTERS[len(letters)] if letters else ""),
+        _presses(found, letter) if found.presses else _chosen(found, kinds[found.choice.method], letter),
         *_peers(found),
         *_bursts_in_time(found),
     )
@@ -68,18 +75,20 @@ def _time_plot(
         title=f"Accuracy against time{' and light' if found.light else ''}: {found.scene}",
         subtitle=_subtitle(found),
         description=_description(found, edge),
-        x=time_axis([mark.x for mark in marks] + [budget_s], _axis_title(found)),
+        x=time_axis([mark.x for mark in marks] + [at for at, _ in limits], _axis_title(found)),
         y=y,
         series=series,
         edge=tuple(edge),
-        limit=(budget_s, f"budget {budget_s:g} s"),
-        ring=(choice.seconds_median, choice.psnr_db, "chosen"),
+        limits=limits,
+        rings=tuple((p.seconds_median, p.psnr_db, "a press" if found.presses else "chosen") for p in ringed(found)),
         right=_correlations(y.low, y.high, found.region.truth_variance),
         right_title="the same as correlation (PCC)",
     )
 
 
 def _axis_title(found: Frontier) -> str:
+    if found.presses:
+        return "from counts in memory to the picture; of a press from its last frame, with the eye's refraction"
     return f"from counts in memory to the picture; {_refraction(found)}"
 
 
@@ -115,6 +124,23 @@ def _chosen(found: Frontier, kind: int, letter: str) -> Series:
     start = Mark(choice.solve_s, choice.psnr_db, weight=0.0)
     whole = Mark(choice.seconds_median, choice.psnr_db, letter, tooltip, LETTER_WEIGHT)
     return Series("chosen", ((start, whole),), kind, named=False)
+
+
+def _presses(found: Frontier, letter: str) -> Series:
+    """Return what a press does with each choice of the time budget; the last one has the letter of its thumbnail."""
+    marks = [
+        Mark(
+            press.seconds_median,
+            press.psnr_db,
+            press.choice,
+            f"a press with the choice {press.choice}, {press.frames} lit: {press.method}, bin {press.bin}, "
+            f"{press.rounds} rounds, {press.seconds_median * 1e3:.0f} ms, {press.psnr_db:.2f} dB, PCC {press.pcc:.3f}",
+        )
+        for press in found.presses
+    ]
+    if letter:
+        marks[-1] = replace(marks[-1], label=letter, weight=LETTER_WEIGHT)
+    return Series("press", tuple((mark,) for mark in marks), BURST_KIND, named=False)
 
 
 def _light_plot(found: Frontier) -> Plot:
@@ -172,6 +198,11 @@ def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
         f"truth. The best within each time: {best}. Within {found.budget_s:g} s the instrument chooses "
         f"{choice.method}, bin {choice.bin}, {choice.rounds} rounds: {choice.psnr_db:.1f} dB in "
         f"{choice.solve_s * 1e3:.0f} ms; {_refraction(found)}."
+        + "".join(
+            f" A press within {press.budget_s:g} s ({press.choice}): {press.psnr_db:.1f} dB in "
+            f"{press.seconds_median * 1e3:.0f} ms."
+            for press in found.presses
+        )
         + (f" More light, refraction included: {bursts}." if bursts else "")
     )
 

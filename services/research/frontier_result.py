@@ -95,6 +95,29 @@ class LightPoint:
 
 
 @dataclass(frozen=True)
+class PressPoint:
+    """What a press makes of its lit frames in green with one choice of the time budget, `budget_s`, named `choice`.
+
+    `frames`: lit frames that it takes. `method`, `bin`, `rounds`: of the picture. `seconds_median`: from the last
+    read-out to the picture in green, with the refraction (`measure_presses`). `within_budget`: in every run.
+    """
+
+    choice: str
+    budget_s: float
+    frames: int
+    method: str
+    bin: int
+    rounds: int
+    seconds_median: float
+    within_budget: bool
+    pcc: float
+    psnr_db: float
+    ssim: float
+    highpass_pcc: float
+    vessel_contrast: float | None
+
+
+@dataclass(frozen=True)
 class PeerPoint:
     """Picture of a peer on the same frame: its name with version and rounds, time in seconds and scores."""
 
@@ -179,6 +202,8 @@ class Frontier:
         Methods without a point on the Pareto front.
     light
         Bursts of a scene, from one frame on; empty for a recorded frame.
+    presses
+        What a press does with each choice of the time budget; empty for a recorded frame.
     left_out
         Points without a result, with the reason.
     peers
@@ -199,6 +224,7 @@ class Frontier:
     choice: Choice
     dominated: tuple[str, ...]
     light: tuple[LightPoint, ...] = ()
+    presses: tuple[PressPoint, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     peers: tuple[PeerPoint, ...] = ()
 

@@ -28,6 +28,6 @@ def draw_sweep(frame: str, names: Sequence[str], unlikelihood: Sequence[float]) 
             x=x,
             y=value_axis(lost, "log evidence per frequency, less the best"),
             series=(Series("PSF", (marks,)),),
-            ring=(best, lost[best], names[best]),
+            rings=((best, lost[best], names[best]),),
         )
     )

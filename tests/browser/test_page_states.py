@@ -272,6 +272,10 @@ def test_warnings_about_a_picture_are_shown_with_it(open_page: Open, real: Real)
     assert height < 2 * letter, "the verdict has one line beside the button"
     details.tap()
     expect(page.locator("#details")).to_contain_text("of the frame cannot be used (saturated")
+    plan = real.rig.world.plan
+    simulated = [decision.name for decision in plan if decision.simulated]
+    effects = page.locator("#details dt:has-text('Simulated effects') + dd")
+    expect(effects).to_have_text(f"{len(simulated)} of {len(plan)}: {', '.join(simulated)}")
 
 
 def test_heartbeat_timeout_disables_shutter(open_page: Open, real: Real) -> None:

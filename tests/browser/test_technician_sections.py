@@ -26,13 +26,12 @@ POINTS = [
     {"method": "tikhonov", "bin": 1, "rounds": 0, "seconds_median": 0.020, "psnr_db": 27.1, "pareto": False},
     {"method": "gradient", "bin": 2, "rounds": 0, "seconds_median": 0.004, "psnr_db": 28.0, "pareto": True},
     {"method": "variation", "bin": 2, "rounds": 8, "seconds_median": 0.090, "psnr_db": 31.5, "pareto": True},
-    {"method": "open", "bin": 2, "rounds": 8, "seconds_median": 0.300, "psnr_db": 32.0, "pareto": True},
-]  # the last one is for an unknown field: it is not shown
+]
+PLOT_PX = 960
 MEASURED = {
     "scene": "A scene",
     "measured_at": "2026-11-01T09:30:00+00:00",
     "budget_s": 0.26,
-    "region": {"field_known": True},
     "points": POINTS,
 }
 
@@ -46,6 +45,8 @@ def technician_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serv
     copy_small_plans(server.data)
     (server.data / "accuracy").mkdir(parents=True)
     (server.data / "accuracy" / "frontier.json").write_text(json.dumps(MEASURED))
+    drawing = f'<svg xmlns="http://www.w3.org/2000/svg" width="{PLOT_PX}" height="300"><title>plot</title></svg>'
+    (server.data / "accuracy" / "frontier.svg").write_text(drawing)
     server.start()
     server.wait_until_ready()
     body = json.dumps({"eye": "OD"}).encode()
@@ -136,7 +137,9 @@ def test_capture_is_recomputed_and_time_limit_is_stored(technician_page: Page) -
     expect(technician_page.locator("tbody tr")).to_have_count(2)  # the Pareto front
     technician_page.get_by_label("Also list what something better beats").tap()
     expect(technician_page.locator("tbody tr")).to_have_count(3)
-    expect(technician_page.locator("svg.plot circle")).to_have_count(3)
+    plot = technician_page.locator("img.plot")
+    expect(plot).to_have_js_property("complete", True)
+    assert plot.evaluate("plot => plot.naturalWidth") == PLOT_PX
     technician_page.locator("tbody tr", has_text="variation").get_by_role("button").tap()
     kept, again = technician_page.locator("eye-pic").nth(0), technician_page.locator("eye-pic").nth(1)
     expect(again).to_have_attribute("data-mark", "final", timeout=60_000)

@@ -443,6 +443,7 @@ def accuracy() -> list[dict[str, Any]]:
         log.ask(again, f"{at}?method=gradient", note="no technician is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
         log.ask("GET /api/technician/accuracy")
+        log.ask("GET /api/technician/accuracy.svg", note="nothing is measured")
         log.ask("PUT /api/technician/pace", json={"pace": "quick"})
         log.ask("PUT /api/technician/pace", json={"pace": "never"})
         log.ask(again, f"{at}?method=gradient&bin=2&rounds=3")
@@ -453,6 +454,7 @@ def accuracy() -> list[dict[str, Any]]:
         log.ask("POST /api/technician/accuracy", note="a measurement is under way")
         until(lambda: not device.explorer.state().busy)
         log.ask("GET /api/technician/accuracy", note="measured")
+        log.ask("GET /api/technician/accuracy.svg", note="measured")
         return log.exchanges
 
 

@@ -104,7 +104,7 @@ class Transcript:
             return self._normaliser.json(answer.json(), "report" if answer.url.path.endswith("report.json") else "")
         if kind == "image/tiff":
             return described_tiff(answer.content)
-        if kind.startswith("image/"):
+        if kind.startswith("image/") and kind != "image/svg+xml":
             return self._normaliser.json(described_image(answer.content), "report")
         if kind == "application/zip":
             return self._zip(answer.content)

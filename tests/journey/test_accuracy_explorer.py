@@ -14,11 +14,18 @@ from device.config.head_file import InstrumentSpec, load_head
 from device.errors import DiffuscopeError, SettingError
 from device.recon.reconstructor import Recipe
 from device.sim.scene_files import simulate_exposure
-from services.errors import Busy
+from services.errors import Busy, RecordNotFound
 from services.imaging.picture_files import raw_tiff
 from services.imaging.raw_metadata import RawMetadata
-from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture, simulated_head
+from services.instrument.accuracy_explorer import (
+    SCENE,
+    SHIPPED_HEAD,
+    AccuracyExplorer,
+    StoredCapture,
+    simulated_head,
+)
 from services.instrument.background import run_in_subprocess
+from services.instrument.measured_frontier import MeasuredFrontier
 from services.research.frontier import measure_scene
 from tests.journey.conftest import SMALL_HEAD
 
@@ -30,6 +37,11 @@ def _exit_early(report: Any) -> None:
 
 def _raise_refusal(word: str, report: Any) -> None:
     raise SettingError(f"{word} is not one", "Take another.")
+
+
+def _measured_at_once(*arguments: Any) -> tuple[MeasuredFrontier, str]:
+    arguments[-1]("timing")
+    return MeasuredFrontier(scene="at once", budget_s=0.26, points=()), "<svg/>"
 
 
 @pytest.fixture
@@ -82,12 +94,40 @@ def test_a_measurement_uses_the_sensor_of_this_device_and_is_stored(
     assert "Small simulated head" in found.scene
     assert (found.measured_at or "").startswith("2026-01-01")
     assert any(point.pareto for point in found.points)
+    assert not state.shipped
+    assert "Small simulated head" in explorer.plot()
     assert any("timing, turn" in message for message in messages)
     assert messages[-1] == ""
     again = AccuracyExplorer(
         tmp_path / "accuracy", tmp_path / "plans", VirtualClock(), spec, lambda kind, progress: None, measure_scene
     )
     assert again.state().measured == found
+
+
+def test_the_simulated_head_shows_the_shipped_measurement_until_its_own(tmp_path: Path) -> None:
+    spec = load_head(SHIPPED_HEAD)
+    explorer = AccuracyExplorer(
+        tmp_path / "own", tmp_path / "plans", VirtualClock(), spec, lambda kind, progress: None, _measured_at_once
+    )
+    before = explorer.state()
+    assert before.measured is not None
+    assert before.shipped
+    assert before.measured.scene == simulated_head(spec, load_head(SCENE)).name, "write it again: make frontier"
+    assert before.measured.model_dump()["machine"]["cpu"]
+    assert before.measured.scene in explorer.plot()
+    explorer.measure()
+    for thread in _threads("frontier"):
+        thread.join(60)
+    after = explorer.state()
+    assert after.measured is not None
+    assert not after.shipped
+    assert (after.measured.scene, explorer.plot()) == ("at once", "<svg/>")
+
+
+def test_another_head_has_no_measurement_before_its_own(explorer: AccuracyExplorer) -> None:
+    assert explorer.state().measured is None
+    with pytest.raises(RecordNotFound):
+        explorer.plot()
 
 
 def test_a_capture_is_reconstructed_by_another_method_and_marked_as_simulated(

@@ -83,6 +83,7 @@ FILES = {  # operations whose answer is no JSON, with its media types
     "GET /api/visits/{id}/montage/{eye}/picture.png": {"image/png"},
     "GET /api/technician/event-log.txt": {"text/plain"},
     "GET /api/technician/captures/{id}/again.png": {"image/png"},
+    "GET /api/technician/accuracy.svg": {"image/svg+xml"},
 }
 
 

@@ -40,7 +40,7 @@ from services.archive.result import ResultFolder
 from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
 from services.imaging.picture_files import raw_tiff, to_png
 from services.imaging.raw_metadata import RawMetadata
-from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
+from services.instrument.accuracy_explorer import SHIPPED, AccuracyExplorer, StoredCapture
 from services.instrument.camera_tap import CameraTap
 from services.instrument.capture import ExposedCapture, Press, capture_files
 from services.instrument.events import EventBus
@@ -289,8 +289,8 @@ def check_embedded(text: str, simulated: bool, count: int) -> None:
 def test_pictures_of_the_documents() -> None:
     for name in ("human-eye.png", "heads-eye.png"):
         check(ROOT / "hardware/pictures" / name, True)
-    for name in ("frontier.svg", "frontier-eye.svg"):
-        check_embedded((ROOT / "hardware/pictures" / name).read_text(), True, 5)
+    for path in (SHIPPED / "frontier.svg", ROOT / "hardware/pictures/frontier-eye.svg"):
+        check_embedded(path.read_text(), True, 5)
 
 
 # ---- Endpoints

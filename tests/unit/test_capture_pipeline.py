@@ -30,6 +30,7 @@ from device.values import (
     Frame,
     Illumination,
     Reconstruction,
+    SimulatedEffects,
     Verdict,
     WhiteReference,
 )
@@ -179,6 +180,20 @@ def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
     assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
     assert capture.report.seconds["expose"] == pytest.approx(shot.exposure.duration_s)
     assert set(files_of()) == {"raw.tiff", "dark.tiff", "picture.png", "green.jpg", "quick.jpg", "report.json"}
+
+
+def test_a_record_names_the_effects_of_a_simulated_frame_only(bench: Bench) -> None:
+    shot = bench.exposed()
+    *_, made = bench.pipeline.reconstruct(shot)
+    assert isinstance(made, Reconstruction)
+    effects = bench.pipeline.record(shot, made, shot.verdict, 5.0)[0].report.effects
+    plan = bench.world.plan
+    assert effects == SimulatedEffects(tuple(decision.name for decision in plan if decision.simulated), len(plan))
+    assert 0 < len(effects.names) < effects.known
+    lit = replace(shot.frame, effects=None)  # as a real camera gives it
+    real = replace(shot, exposure=replace(shot.exposure, lit=[lit]))
+    report = bench.pipeline.record(real, made, shot.verdict, 5.0)[0].report
+    assert "effects" not in report.as_json()
 
 
 def test_a_live_picture_is_exposed_in_the_aiming_colour(bench: Bench) -> None:

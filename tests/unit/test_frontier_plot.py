@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image as Pictures
 
 from device.recon.methods import METHODS
-from services.research.frontier_plot import draw_frontier, drawn_points
+from services.instrument.time_budget import PACES_S
+from services.research.frontier_plot import draw_frontier, drawn_points, ringed
 from services.research.frontier_result import (
     BestMu,
     Choice,
@@ -23,6 +24,7 @@ from services.research.frontier_result import (
     Machine,
     PeerPoint,
     Point,
+    PressPoint,
     ScoredRegion,
 )
 from services.research.frontier_thumbnails import (
@@ -45,7 +47,9 @@ KINDS = [
 LARGEST_BYTES = 250_000  # of a committed picture
 
 
-def measured(rng: np.random.Generator, field_known: bool = True, refract_s: float = 0.04) -> Frontier:
+def measured(
+    rng: np.random.Generator, field_known: bool = True, refract_s: float = 0.04, presses: bool = True
+) -> Frontier:
     """Return a measurement with all methods, bursts and peers, with random times and accuracies."""
     points = tuple(
         Point(*kind, 10 ** rng.uniform(-2.3, 0), 1.0, pcc=0.9, psnr_db=rng.uniform(24, 31), **SCORES) for kind in KINDS
@@ -73,6 +77,13 @@ def measured(rng: np.random.Generator, field_known: bool = True, refract_s: floa
         choice,
         (),
         light,
+        tuple(
+            PressPoint(name, budget_s, 4, "variation", 1, 8, 0.7 * budget_s, True, pcc=0.9, psnr_db=31.0, **SCORES)
+            for name, budget_s in PACES_S.items()
+        )
+        if presses
+        else (),
+        (),
         tuple(PeerPoint(f"LenslessPiCam 1, {n} rounds", n / 1.0, 0.8, 28.0, 0.6) for n in (10, 40, 100)),
     )
 
@@ -85,7 +96,7 @@ def panel_boxes(drawing: str) -> list[list[TextBox]]:
 
 def thumbnails(rng: np.random.Generator, found: Frontier):
     truth = rng.uniform(0, 1, (600, 900))
-    points = nearest_points(drawn_points(found), found.choice.seconds_median)
+    points = nearest_points(drawn_points(found), ringed(found)[-1].seconds_median)
     shown = [Shown(("5.0 ms, 29.1 dB", "variation, bin 3", "12 rounds, chosen"), truth) for _ in range(len(points) + 1)]
     return thumbnail_panel(shown, truth, np.ones(truth.shape, np.bool_), False)
 
@@ -95,10 +106,10 @@ def letters(drawing: str) -> list[str]:
 
 
 @settings(max_examples=12, deadline=None)
-@given(st.integers(0, 10_000), st.booleans())
-def test_no_two_texts_intersect_and_all_lie_within_the_picture(seed, field_known):
+@given(st.integers(0, 10_000), st.booleans(), st.booleans())
+def test_no_two_texts_intersect_and_all_lie_within_the_picture(seed, field_known, presses):
     rng = np.random.default_rng(seed)
-    found = measured(rng, field_known)
+    found = measured(rng, field_known, presses=presses)
     drawing = draw_frontier(found, thumbnails=thumbnails(rng, found))
     panels = panel_boxes(drawing)
     assert len(panels) == 3
@@ -129,13 +140,21 @@ def test_paper_method_has_filled_marks_at_the_best_mu_and_hollow_ones_at_gcv():
 
 
 def test_choice_is_drawn_at_its_whole_time_and_the_axis_names_the_refraction():
-    found = measured(np.random.default_rng(3))
+    found = measured(np.random.default_rng(3), presses=False)
     whole = draw_frontier(found)
     assert "the chosen one includes 40 ms for the eye&#x27;s refraction" in whole
-    none = draw_frontier(measured(np.random.default_rng(3), refract_s=0.0))
+    none = draw_frontier(measured(np.random.default_rng(3), refract_s=0.0, presses=False))
     assert "the budget leaves no time for the eye&#x27;s refraction" in none
     before, after = (float(re.findall(r'class="ring" cx="([\d.]+)"', drawing)[0]) for drawing in (none, whole))
     assert after > before
+
+
+def test_each_time_budget_has_a_line_and_what_a_press_does_has_a_ring():
+    drawing = draw_frontier(measured(np.random.default_rng(7)))
+    lines = re.findall(r'class="limit"/>\n<text[^>]*>([^<]*)<', drawing)
+    assert lines == [f"{name} {budget_s:g} s" for name, budget_s in PACES_S.items()]
+    assert len(re.findall(r"<title>a press</title>", drawing)) == len(PACES_S)
+    assert "chosen:" not in drawing
 
 
 def test_every_thumbnail_has_its_letter_at_a_mark():

@@ -49,7 +49,7 @@ def test_marks_lie_within_the_frame(values):
 
 
 def test_plot_has_texts_for_screen_readers():
-    root = plotted([Mark(0.1, 1.0, tooltip="a"), Mark(0.2, 2.0, tooltip="b")], ring=(0.2, 2.0, "chosen"))
+    root = plotted([Mark(0.1, 1.0, tooltip="a"), Mark(0.2, 2.0, tooltip="b")], rings=((0.2, 2.0, "chosen"),))
     assert root.get("role") == "img"
     named = {element.get("id") for element in root.iter() if element.get("id")}
     assert set((root.get("aria-labelledby") or "").split()) == named

@@ -8,7 +8,7 @@ from pathlib import Path
 import jsonschema_rs
 import pytest
 
-from device.values import ONLY_FRAME, ChannelUse, Report
+from device.values import ONLY_FRAME, ChannelUse, Report, SimulatedEffects
 from services.records.capture import CaptureReport, CaptureVersion, EyeConfirmation, EyeCorrection, RecordOrigin
 from services.research import report_schema
 from services.research.reconstruct_file import FileReport
@@ -54,6 +54,7 @@ def test_every_key_of_every_report_has_a_description() -> None:
         versions=(CaptureVersion(1, "a"),),
         from_read_out_s=1.0,
         from_tap_s=2.0,
+        effects=SimulatedEffects(("shot",), 29),
     )
     properties = schema["properties"]
     assert isinstance(properties, dict)

@@ -1,14 +1,12 @@
 // <accuracy-time>: accuracy against reconstruction time as measured on this device, comparison of a capture at a
 // measured point with the kept picture, and choice of the time limit. The table holds the same values as the plot.
 
-import { html, render, svg } from "../vendor/lit-html.js";
+import { html, render } from "../vendor/lit-html.js";
 import { ApiError, sentences } from "../core/api.js";
 import { viewersOf } from "../components/viewer/viewer.js";
 import { clockTime, number, t } from "../i18n/translate.js";
 
-const WIDTH = 720, HEIGHT = 400, LEFT = 64, RIGHT = 16, TOP = 16, BELOW = 56;
 const POLL_MS = 1000;
-const TICKS_S = [0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30];
 const ZOOMS = [1, 2, 4];
 const ALL = Object.freeze({ zoom: 1, u: 0, v: 0 });
 
@@ -140,11 +138,11 @@ function paceButtons({ pace, paces_s: paceButtons }, actions) {
   `;
 }
 
-function measuring({ busy, progress, problem, measured }, actions) {
+function measuring({ busy, progress, problem, measured, shipped }, actions) {
   return html`
     <p role="status" aria-live="polite">
-      ${busy ? `${t("explore.busy")} ${progress}` : measured ? t("explore.when", {
-        day: measured.measured_at.slice(0, 10), time: clockTime(measured.measured_at), scene: measured.scene,
+      ${busy ? `${t("explore.busy")} ${progress}` : measured ? t(shipped ? "explore.shipped" : "explore.when", {
+        day: measured.measured_at.slice(0, 10), time: clockTime(measured.measured_at), scene: measured.scene, computer: measured.machine?.cpu,
       }) : t("explore.never")}
       ${problem ? html`<span class="bad">${sentences(problem)}</span>` : ""}
     </p>
@@ -153,12 +151,10 @@ function measuring({ busy, progress, problem, measured }, actions) {
 }
 
 function points({ accuracy, all, capture, captures }, actions) {
-  const { budget_s: budget, region } = accuracy.measured;
-  // The method for an unknown field is left out where the field is known: a capture never uses it there.
-  const points = accuracy.measured.points.filter((point) => point.method !== "open" || !region?.field_known);
+  const { measured_at, points } = accuracy.measured;
   const rows = points.filter((point) => all || point.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   return html`
-    ${plot(points, budget, actions, capture !== null)}
+    <div class="wide" tabindex="0"><img class="plot" src="/api/technician/accuracy.svg?of=${measured_at}" alt=${t("explore.plot")} /></div>
     <div class="row">
       <label><input type="checkbox" .checked=${all} @change=${actions.showAll} /> ${t("explore.all")}</label>
     </div>
@@ -181,32 +177,6 @@ function points({ accuracy, all, capture, captures }, actions) {
       </tr>`)}</tbody>
     </table>
   `;
-}
-
-function plot(points, budget, actions, live) {
-  const times = points.map((point) => point.seconds_median).concat(budget);
-  const psnrs_db = points.map((point) => point.psnr_db);
-  const [first, last] = [Math.log10(Math.min(...times)) - 0.1, Math.log10(Math.max(...times)) + 0.1];
-  const [low, high] = [Math.floor(Math.min(...psnrs_db) - 0.5), Math.ceil(Math.max(...psnrs_db) + 0.5)];
-  const x = (seconds) => LEFT + ((Math.log10(seconds) - first) / (last - first)) * (WIDTH - LEFT - RIGHT);
-  const y = (db) => HEIGHT - BELOW - ((db - low) / (high - low)) * (HEIGHT - TOP - BELOW);
-  const step = Math.max(1, Math.ceil((high - low) / 6));
-  const psnrTicks_db = Array.from({ length: Math.floor((high - low) / step) + 1 }, (_, k) => low + k * step);
-  const paretoFront = points.filter((point) => point.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
-  // Hidden from screen readers; the table holds the same values.
-  return html`<svg class="plot" viewBox="0 0 ${WIDTH} ${HEIGHT}" aria-hidden="true" focusable="false">
-    ${psnrTicks_db.map((db) => svg`<line class="grid" x1=${LEFT} x2=${WIDTH - RIGHT} y1=${y(db)} y2=${y(db)} />
-      <text x=${LEFT - 8} y=${y(db) + 5} text-anchor="end">${db}</text>`)}
-    ${TICKS_S.filter((s) => Math.log10(s) > first && Math.log10(s) < last).map((s) => svg`
-      <text x=${x(s)} y=${HEIGHT - BELOW + 22} text-anchor=${x(s) > WIDTH - 40 ? "end" : "middle"}>${s < 1 ? `${number(s * 1000)} ms` : `${number(s)} s`}</text>`)}
-    <text x=${(LEFT + WIDTH) / 2} y=${HEIGHT - 8} text-anchor="middle">${t("explore.x")}</text>
-    <text x="4" y=${TOP - 2}>${t("explore.y")}</text>
-    <line class="limit" x1=${x(budget)} x2=${x(budget)} y1=${TOP} y2=${HEIGHT - BELOW} />
-    <polyline class="edge" points=${paretoFront.map((point) => `${x(point.seconds_median)},${y(point.psnr_db)}`).join(" ")} />
-    ${points.map((point) => svg`<circle class=${point.pareto ? "best" : "other"} r=${point.pareto ? 8 : 4}
-      cx=${x(point.seconds_median)} cy=${y(point.psnr_db)} @click=${() => live && actions.recompute(point)}>
-      <title>${t("explore.see.one", point)}</title></circle>`)}
-  </svg>`;
 }
 
 function comparison({ capture, head, point, recomputed, viewport }, actions) {

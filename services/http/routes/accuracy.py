@@ -7,13 +7,14 @@ from fastapi import APIRouter, Query
 from device.errors import CalibrationMissing
 from device.recon.reconstructor import Recipe
 from device.values import Calibration
-from services.http.media import PngResponse, file_responses
+from services.http.media import PngResponse, SvgResponse, file_responses
 from services.http.problem_responses import error_text
 from services.http.schemas.accuracy import AccuracyAnswer, TimeBudgetChoice
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
 from services.records.capture_store import CaptureStore
 
 PNG = file_responses("image/png")
+SVG = file_responses("image/svg+xml")
 
 
 def accuracy_routes(
@@ -48,12 +49,17 @@ def _accuracy_router(explorer: AccuracyExplorer) -> APIRouter:
         """Return the measured accuracy and time of every method on this device, and the chosen time budget."""
         return accuracy_answer(explorer)
 
+    @router.get("/accuracy.svg", response_class=SvgResponse, responses=SVG)
+    def plot() -> SvgResponse:
+        """Return the plot of the measured accuracy and time as SVG; 404 before a measurement."""
+        return SvgResponse(explorer.plot())
+
     @router.post("/accuracy", status_code=202)
     def measure() -> AccuracyAnswer:
         """Start to measure every method on this device, in the background.
 
-        The measurement takes minutes; captures have priority. Answers 202 with the state; 409 while another measurement
-        or picture is computed.
+        The measurement takes about a minute; captures have priority. Answers 202 with the state; 409 while another
+        measurement or picture is computed.
         """
         explorer.measure()
         return accuracy_answer(explorer)
@@ -72,6 +78,7 @@ def accuracy_answer(explorer: AccuracyExplorer) -> AccuracyAnswer:
     now = explorer.state()
     return AccuracyAnswer(
         measured=now.measured,
+        shipped=now.shipped,
         pace=now.pace,
         paces_s=dict(now.paces_s),
         busy=now.busy,

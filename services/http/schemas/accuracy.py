@@ -15,10 +15,12 @@ class TimeBudgetChoice(RequestBody):
 class AccuracyAnswer(ResponseBody):
     """Last measurement, selected time budget, progress of a running computation (`progress`), and last error.
 
-    `paces_s`: time budgets in seconds by name. `busy`: a computation is running. `scene`: the simulated scene.
+    `shipped`: the measurement was made on another computer and ships with the simulated head. `paces_s`: time budgets
+    in seconds by name. `busy`: a computation is running. `scene`: the simulated scene.
     """
 
     measured: MeasuredFrontier | None
+    shipped: bool
     pace: Pace
     paces_s: dict[Pace, float]
     busy: bool
