@@ -487,3 +487,15 @@ def test_automatic_capture_when_ready(open_page: Open, real: Real) -> None:
     real.show(None)
     page.wait_for_selector("[data-screen=picture]")
     assert real.presses == 1
+
+
+def test_finish_while_the_visit_is_loading_ends_nothing(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    held: list[Route] = []
+    page.route("**/api/visits/*", lambda route: held.append(route))  # never answered
+    page.reload()
+    after_debounce(page).locator("#finish").tap()
+    expect(page.locator("#finish")).to_have_text("Finish with what we have")
+    after_debounce(page)
+    assert held, "it is still loading"
+    assert real.visit()["finished_at"] is None

@@ -13,7 +13,7 @@ import { has, t } from "../i18n/translate.js";
 export function aim(state, actions) {
   const { eye, part } = slotLabel(state, state.route.slot);
   if (state.asking) return html`${question(state, actions)} ${tiles(state, actions)}`;
-  const answered = Object.values(state.visit?.slots ?? {}).every((slot) => slot.state !== "empty");
+  const answered = state.visit !== null && Object.values(state.visit.slots).every((slot) => slot.state !== "empty");
   const here = state.visit?.slots[state.route.slot ?? ""];
   return html`
     <h2 class="slot-title">${eye} · ${part}</h2>
