@@ -43,10 +43,16 @@ MIN_COARSE = 200  # samples of a quick look along its shorter side, to be regist
 
 @dataclass(frozen=True)
 class JoinedFrame:
-    """A burst as one frame: linear DN above dark, (rows, cols) float32, NaN where too few frames saw the pixel.
+    """A burst as one frame.
 
-    `light` is a ratio: the sum of the light of the used frames over that of the first used one, the reference.
-    `frames` has one entry per frame.
+    Attributes
+    ----------
+    counts
+        Linear DN above dark, float32 (rows, cols), NaN where too few frames saw the pixel.
+    light
+        Ratio of the sum of the light of the used frames to that of the first used one, the reference.
+    frames
+        What became of each frame, one entry per frame.
     """
 
     counts: Image

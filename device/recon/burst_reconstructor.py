@@ -71,7 +71,7 @@ class BurstReconstructor:
             self._warm_up()
 
     def _warm_up(self) -> None:
-        """Make a picture of two frames of noise, to compile the kernels and to measure the cost."""
+        """Join two frames of noise, to compile the kernels and to measure the cost."""
         noise = noise_frame(self.single.calibration, self.single.shape)
         for _ in range(2):  # the first one compiles
             self.see_cost = DurationEstimate()
@@ -214,7 +214,29 @@ class BurstReconstructor:
         unusable: Mapping[int, str],
         prepared: Mapping[int, PreparedFrame],
     ) -> JoinedFrame:
-        """Return the joined frame for `steps` of the same frames; arguments and errors as for `steps`."""
+        """Return the joined frame, for `steps` of the same frames.
+
+        Parameters
+        ----------
+        frames
+            Counts of each frame, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of all of them; None: that of the calibration.
+        unusable
+            Reason of each frame that must not enter the picture, by its index.
+        prepared
+            Frames that are prepared with this dark frame, by index.
+
+        Returns
+        -------
+        JoinedFrame
+            The frame that `steps` solves.
+
+        Raises
+        ------
+        FrameError
+            No frame can be used.
+        """
         run = _Run(self, None)
         deque(run.join(frames, dark, unusable, _seen(prepared)), maxlen=0)
         assert run.joined is not None

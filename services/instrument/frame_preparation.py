@@ -51,7 +51,7 @@ def ranked(verdicts: Sequence[Verdict]) -> tuple[list[int], dict[int, str]]:
 class FramePreparation:
     """Preparation of the frames of one press in a thread of its own; a context, at whose exit the thread has ended.
 
-    The thread of the press calls the methods. Until `finish` it must not use `assessor`, `bursts` and what `looked`
+    The thread of the press calls the methods. Until the exit it must not use `assessor`, `bursts` and what `looked`
     uses: the thread of the preparation does. Only frames in the light of the burst, `colour`, are prepared. `begin_s`:
     begin of the press (clock seconds). `looked` is called once, with the quick look of the first useful frame, whose
     refraction is estimated with `refract`, its cylinder with `cylinder`. `alone`: the press takes one lit frame.
