@@ -1,7 +1,5 @@
 """Layout stability, labels of pictures and visits, and navigation back."""
 
-import re
-
 import pytest
 from playwright.sync_api import Page, Route, expect
 
@@ -42,9 +40,6 @@ def test_no_layout_shift_during_capture(open_page: Open, real: Real, size: tuple
     assert boxes(page, *moving) == before
     page.wait_for_selector(".stage[data-mark=final]")
     assert boxes(page, *moving) == before
-    made = page.locator(".card .made")
-    assert len(re.findall(r"\d+\.\d", made.inner_text())) == 2, "seconds from the read-out and from the tap"
-    assert made.evaluate("line => line.scrollWidth <= line.clientWidth"), "the whole line is seen"
     tap(page, "#open-details")
     assert boxes(page, *moving) == before
     assert look_for_faults(page) == []

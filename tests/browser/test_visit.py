@@ -302,8 +302,9 @@ def test_finished_visit_is_reopened_and_qr_code_has_no_name(open_page: Open, mak
     visit = real.begin_visit(consent="agreed", name="Lakshmi")
     for slot in ("R-centre", "R-nerve", "L-centre"):
         real.press(visit["id"], slot)
-    page = after_debounce(open_page(f"{real.url}/#/visit/{visit['id']}/aim/L-nerve"))
-    finish_early(page)
+    page = open_page(f"{real.url}/#/visit/{visit['id']}/aim/L-nerve")
+    wait_for_preview(page)
+    finish_early(after_debounce(page))
     page.locator("#code").tap()
     page.wait_for_selector("figure.code svg path")
     decoded = qr_text(page)

@@ -26,6 +26,13 @@ export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylind
   return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
 }
 
+/** How long a picture took, of its time budget and from the tap; "" where it is not known. */
+function madeText({ budget_s: budget, from_read_out_s: s = null, from_tap_s: tap = null }) {
+  const digits = budget < 1 ? 2 : 1;
+  if (s === null || tap === null) return "";
+  return t("made.in", { s: number(s, digits), budget: number(budget, digits), tap: number(tap, 1) });
+}
+
 function psfText({ gain_db: gain = null }) {
   return gain === null ? t("detail.psf.cylinder") : t("detail.psf.gain", { db: number(gain, 1) });
 }
@@ -47,6 +54,7 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
     ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
     ...(report.psf_cylinder ? [["psf", psfText(report.psf_cylinder)]] : []),
     ...(report.effects ? [["effects", effectsText(report.effects)]] : []),
+    ...(madeText(report) ? [["seconds", madeText(report)]] : []),
     ["calibration", calibration],
     ["id", id],
   ];

@@ -218,7 +218,7 @@ export async function retryUploads(visit) {
  */
 export async function finish({ isSure = false } = {}) {
   const { visit } = get().route;
-  if (!get().protocol || get().visit?.id !== visit) return; // still loading: what is missing is not known yet
+  if (!visit || !get().protocol || get().visit?.id !== visit) return; // still loading: what is missing is not known yet
   if (!isSure && missingPictures(get()) && get().visit?.fields.consent !== "declined") return set({ asking: "finish" });
   lowerAlert("shot.crossed"); // undo would need a reopened visit
   if (pendingCaptures(get(), visit).length) {

@@ -54,16 +54,9 @@ function card(state, actions, capture) {
         ${timer(state, actions, capture) ?? (capture.record ? detailsButton(actions, capture.record) : nothing)}
       </div>
       <p>${text}</p>
-      ${capture.over ? html`<p class="muted made">${madeText(capture.record?.report ?? {})}</p>` : progressBar(capture)}
+      ${capture.over ? nothing : progressBar(capture)}
     </div>
   `;
-}
-
-/** How long a picture took, of its time budget and from the tap; "" where it is not known. */
-function madeText({ budget_s: budget, from_read_out_s: s = null, from_tap_s: tap = null }) {
-  const digits = budget < 1 ? 2 : 1;
-  if (s === null || tap === null) return "";
-  return t("made.in", { s: number(s, digits), budget: number(budget, digits), tap: number(tap, 1) });
 }
 
 function detailsButton(actions, { report }) {
