@@ -177,7 +177,7 @@ class AccuracyExplorer:
 
     def _measured_folder(self) -> Path | None:
         """Return the folder of the last measurement, else of the shipped one if it is of this head."""
-        if _measured_in(self.folder) is not None:
+        if (self.folder / "frontier.svg").is_file() and _measured_in(self.folder) is not None:
             return self.folder
         return SHIPPED if self._is_shipped_head else None
 

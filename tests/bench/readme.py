@@ -30,7 +30,8 @@ class Row:
     def missing(self, log: Path) -> list[str]:
         """Return the promised words that are not in the output."""
         printed = log.read_text(encoding="utf-8", errors="replace")
-        return [words for words in self.promised if words not in printed]
+        # not within a number: 10 violations are not 0 violations
+        return [words for words in self.promised if not re.search(rf"(?<!\d){re.escape(words)}", printed)]
 
 
 def rows() -> list[Row]:
