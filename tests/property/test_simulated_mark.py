@@ -613,6 +613,7 @@ ENDPOINTS = {
     "/api/calibration/preview",
     "/api/captures/{id}/{name}",
     "/api/preview",
+    "/api/technician/accuracy.svg",  # of a simulated eye on any head: test_pictures_of_the_documents
     "/api/technician/captures/{id}/again.png",
     "/api/visits/{id}/export.zip",
     "/api/visits/{id}/montage/{eye}/picture.png",
