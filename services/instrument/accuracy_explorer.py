@@ -37,7 +37,7 @@ from services.instrument.time_budget import PACES_S, Pace
 log = logging.getLogger(__name__)
 
 SCENE = Path(__file__).parents[2] / "device" / "sim" / "scenes" / "diabetic.toml"
-BUDGET_S = 0.26  # the paper's time budget, marked in the plot
+BUDGET_S = 0.26  # the paper's time budget, for the choice from one frame
 REPEATS = 2  # timed turns of every point: a measurement takes about a minute
 LARGEST_BIN = 16
 SHIPPED = Path(__file__).parent / "simulated_frontier"  # of the head below

@@ -1,5 +1,5 @@
-// <accuracy-time>: accuracy against reconstruction time as measured on this device, comparison of a capture at a
-// measured point with the kept picture, and choice of the time limit. The table holds the same values as the plot.
+// <accuracy-time>: accuracy against reconstruction time, measured on this device or shipped, comparison of a capture at a
+// measured point with the kept picture, and choice of the time limit. The table holds the points of the plot.
 
 import { html, render } from "../vendor/lit-html.js";
 import { ApiError, sentences } from "../core/api.js";
@@ -154,7 +154,7 @@ function points({ accuracy, all, capture, captures }, actions) {
   const { measured_at, points } = accuracy.measured;
   const rows = points.filter((point) => all || point.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   return html`
-    <div class="wide" tabindex="0"><img class="plot" src="/api/technician/accuracy.svg?of=${measured_at}" alt=${t("explore.plot")} /></div>
+    <div class="wide" tabindex="0" role="group" aria-label=${t("explore.title")}><img class="plot" src="/api/technician/accuracy.svg?of=${measured_at}" alt=${t("explore.plot")} /></div>
     <div class="row">
       <label><input type="checkbox" .checked=${all} @change=${actions.showAll} /> ${t("explore.all")}</label>
     </div>
