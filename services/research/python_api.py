@@ -34,7 +34,12 @@ from services.research.frontier import Case, measure_frontier, recorded_case, sc
 from services.research.frontier_result import Frontier
 from services.research.named_files import head_file, scene_file
 from services.research.psf_stack import psf_stack
-from services.research.reconstruct_file import FileReconstruction, FileReconstructor, parse_bayer
+from services.research.reconstruct_file import (
+    FileReconstruction,
+    FileReconstructor,
+    one_picture_reconstructor,
+    parse_bayer,
+)
 from services.research.reconstruct_inputs import RawSource, ReconstructOptions, Source
 
 ImageSource = str | Path | NDArray[Any] | Raw | Psf
@@ -121,7 +126,7 @@ def reconstruct(
     TypeError
         A keyword is no option.
     """
-    return Reconstructor(psf, **options)(raw)
+    return one_picture_reconstructor(_options(psf, options))(_raw(raw))
 
 
 class Reconstructor:

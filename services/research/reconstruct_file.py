@@ -141,12 +141,17 @@ class OutputFiles:
 NO_FILES = OutputFiles()
 
 
+def one_picture_reconstructor(options: ReconstructOptions) -> "FileReconstructor":
+    """Return the reconstruction of one picture, whose FFTs are planned by an estimate unless a budget limits its time."""
+    return FileReconstructor(options, None if options.budget_s else Planner(options.plans, effort=ONCE))
+
+
 def reconstruct_file(raw: Source, options: ReconstructOptions, output: OutputFiles = NO_FILES) -> FileReconstruction:
     """Reconstruct a raw, write picture and sweep plot; return the result before the `even` correction.
 
     The report is not written here. Invalid options raise an error before any computation.
     """
-    reconstruct = FileReconstructor(options, None if options.budget_s else Planner(options.plans, effort=ONCE))
+    reconstruct = one_picture_reconstructor(options)
     refuse_outputs(output, (raw,), options)
     made = reconstruct(raw)
     if output.picture is not None:
