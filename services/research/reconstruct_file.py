@@ -142,7 +142,7 @@ NO_FILES = OutputFiles()
 
 
 def one_picture_reconstructor(options: ReconstructOptions) -> "FileReconstructor":
-    """Return the reconstruction of one picture, whose FFTs are planned by an estimate unless a budget limits its time."""
+    """Return the reconstruction of one picture: its FFTs are planned by estimate, unless a budget limits its time."""
     return FileReconstructor(options, None if options.budget_s else Planner(options.plans, effort=ONCE))
 
 

@@ -23,8 +23,13 @@ FLIPS, SERVED = 10, 2
 BIG = {"raw.tiff": b"r" * 50_000}
 
 
-def captures_before_a_kill(server: Server) -> list[str]:
-    """Take captures, and kill the instrument; return the acknowledged ids."""
+@pytest.fixture(scope="module")
+def killed(
+    served_head: Path, environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[str]]:
+    """Return the data folder of an instrument that was killed after three captures, to be copied, and their ids."""
+    data = tmp_path_factory.mktemp("killed") / "data"
+    server = Server(served_head, data, environment)
     with server.running() as process:
         visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
         server.ask("PATCH", f"/api/visits/{visit}", {"key": "f" * 16, "field": "consent", "value": "agreed"})
@@ -39,7 +44,7 @@ def captures_before_a_kill(server: Server) -> list[str]:
         ]
         process.send_signal(signal.SIGKILL)
         process.wait()
-    return kept
+    return data, kept
 
 
 def flip(log: Path, random_source: random.Random) -> str:
@@ -60,10 +65,9 @@ def complete_captures(data: Path) -> set[str]:
 
 
 def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
-    served_head: Path, environment: dict[str, str], tmp_path: Path
+    killed: tuple[Path, list[str]], served_head: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
-    data, random_source = tmp_path / "data", random.Random(16)
-    kept = captures_before_a_kill(Server(served_head, data, environment))
+    (data, kept), random_source = killed, random.Random(16)
     log = data / "store.sqlite-wal"
     assert log.stat().st_size > 0, "the log is empty, so the test shows nothing"
     spent = spent_of(shutil.copytree(data, tmp_path / "as-it-was"))
@@ -93,11 +97,10 @@ def spent_of(folder: Path) -> dict[str, float]:
 
 
 def test_health_counts_orphans_and_gives_a_remedy(
-    served_head: Path, environment: dict[str, str], tmp_path: Path
+    killed: tuple[Path, list[str]], served_head: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
     """The copy has captures/ and store.sqlite of a killed instrument; health counts the one without a record."""
-    server, data, copy = Server(served_head, tmp_path / "data", environment), tmp_path / "data", tmp_path / "copy"
-    kept = captures_before_a_kill(server)
+    (data, kept), copy = killed, tmp_path / "copy"
     shutil.copytree(data / "captures", copy / "captures")
     shutil.copyfile(data / "store.sqlite", copy / "store.sqlite")
     (copy / "captures" / kept[0] / RECORD).unlink()  # as a release before the record wrote it

@@ -7,7 +7,7 @@ import { icon, target } from "./icons.js";
 import { currentCapture, get, lostCaptures, missingPictures, slotPlan } from "../core/state.js";
 import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { calendarDay, has, t } from "../i18n/translate.js";
+import { calendarDay, has, number, t } from "../i18n/translate.js";
 
 /** @typedef {import("../core/state.js").State} State */
 
@@ -26,10 +26,10 @@ export const fieldLabel = (field) => (has(`field.${field}`) ? t(`field.${field}`
 
 /** Return number, sex and age as one label. */
 export function patientLabel({ number: plain, fields }) {
-  const number = displayNumber(plain);
+  const shown = displayNumber(plain);
   const sex = fields.sex ? t(`sex.${fields.sex}`) : "";
   const details = [sex, fields.age].filter(Boolean).join(", ");
-  return details ? `${number} · ${details}` : number;
+  return details ? `${shown} · ${details}` : shown;
 }
 
 // ---- slot tiles: every picture is shown, also a poor one, with an icon for its state
@@ -106,6 +106,13 @@ export function whyGreen(visit) {
   if (!code) return "";
   if (LIGHT_LIMITS.includes(code)) return t("green.light");
   return t(code === "colour.none" || code === "colour.psf" ? `green.${code.slice(7)}` : "green.failed");
+}
+
+/** How long a picture took, of its time budget and from the tap; "" where it is not known. */
+export function madeText({ budget_s: budget, from_read_out_s: s = null, from_tap_s: tap = null }) {
+  const digits = budget < 1 ? 2 : 1;
+  if (s === null || tap === null) return "";
+  return t("made.in", { s: number(s, digits), budget: number(budget, digits), tap: number(tap, 1) });
 }
 
 const EXAM_BUTTONS = new Set(["otherEye", "finish"]); // only shown during an exam
@@ -206,7 +213,7 @@ export function choice({ label, field, value, options, choose, many = false }) {
 }
 
 /** Name of a version of a picture: its number, and the day on which the store adopted it. */
-export const versionName = ({ number, at }) => t("version.n", { count: number, day: at ? calendarDay(at) : "" });
+export const versionName = ({ number: count, at }) => t("version.n", { count, day: at ? calendarDay(at) : "" });
 
 /**
  * The question in place of the controls: why a picture is not possible, or whether to finish without all pictures.

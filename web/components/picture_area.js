@@ -4,7 +4,7 @@ import { icon } from "./icons.js";
 import { colourLink, finalPicture } from "../core/api.js";
 import { alertText } from "../core/alerts.js";
 import { allowsLight, consentOf, eyeOf, currentCapture } from "../core/state.js";
-import { chips, slotLabel, standing, topAlert, alertBar, versionName, whyGreen } from "./components.js";
+import { chips, madeText, slotLabel, standing, topAlert, alertBar, versionName, whyGreen } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
 
@@ -57,10 +57,20 @@ export function pictureArea(state, actions) {
           @zoomed=${actions.zoomed}
           @loupe=${actions.loupeChanged}
         ></eye-pic>
+        ${none ? "" : made(state, capture)}
       </div> <p class="unseen" aria-live="polite">${announcement(state)}</p>
       ${isExamScreen(state) ? [prompt(state, actions), isAiming(state) ? "" : standing(state, actions), chips(state, actions)] : ""}
     </section>
   `;
+}
+
+/**
+ * The time of a picture in the corner beside the round field; enlarged, the retina is there.
+ * @param {State} state
+ */
+function made({ picture, version, zoom }, capture) {
+  const text = picture === "final" && !version && zoom <= 1 && capture.record ? madeText(capture.record.report) : "";
+  return text ? html`<p class="made">${text}</p>` : "";
 }
 
 /**

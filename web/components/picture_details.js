@@ -1,6 +1,6 @@
 // Details dialog of a picture: reconstruction data, files to download, and the change to the other eye.
 
-import { versionName, whyGreen } from "./components.js";
+import { madeText, versionName, whyGreen } from "./components.js";
 import { icon } from "./icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { number, t } from "../i18n/translate.js";
@@ -24,13 +24,6 @@ export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylind
   const mean = { mean: signed(sphere), sd: number(sd, 2) };
   if (cylinder == null) return t("detail.refraction.mean", mean);
   return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
-}
-
-/** How long a picture took, of its time budget and from the tap; "" where it is not known. */
-function madeText({ budget_s: budget, from_read_out_s: s = null, from_tap_s: tap = null }) {
-  const digits = budget < 1 ? 2 : 1;
-  if (s === null || tap === null) return "";
-  return t("made.in", { s: number(s, digits), budget: number(budget, digits), tap: number(tap, 1) });
 }
 
 function psfText({ gain_db: gain = null }) {
