@@ -28,10 +28,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> diffuscope.SimulatedScene
 
 
 def test_files_on_the_command_line_and_arrays_in_python_give_the_same(
-    scene: diffuscope.SimulatedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: diffuscope.SimulatedScene, tmp_path: Path
 ) -> None:
-    # No wisdom of other processes, which may be written between the two: other plans round otherwise.
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     scene.write(tmp_path)
     raw, psf, picture, report = (tmp_path / name for name in ("raw.tiff", "psf.tiff", "out.npy", "out.json"))
     with pytest.raises(SystemExit, match="0"):

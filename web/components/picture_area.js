@@ -56,8 +56,7 @@ export function pictureArea(state, actions) {
           @fault=${actions.pictureFault}
           @zoomed=${actions.zoomed}
           @loupe=${actions.loupeChanged}
-        ></eye-pic>
-        ${none ? "" : made(state, capture)}
+        ></eye-pic> ${none ? "" : made(state, capture)}
       </div> <p class="unseen" aria-live="polite">${announcement(state)}</p>
       ${isExamScreen(state) ? [prompt(state, actions), isAiming(state) ? "" : standing(state, actions), chips(state, actions)] : ""}
     </section>
