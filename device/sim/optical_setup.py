@@ -148,11 +148,16 @@ class Scene:
 class Size(NamedTuple):
     """Size of an effect: eta, the change of the reconstruction over the reconstruction's noise, and its explanation.
 
-    An eta of exactly zero means no change at all; OPTICS.md 3.1.
+    An eta of exactly zero means no change at all; OPTICS.md 3.1. `shared`: the quantity that the effect changes, where
+    other effects change the same one, so that their etas add up; "" for a change that is independent of the others'.
     """
 
     eta: float
     why: str
+    shared: str = ""
+
+
+MEAN_SPHERE, CONSTANT_LIGHT, LIGHT_OVER_FIELD = "mean sphere", "constant light", "light over the field"
 
 
 @dataclass

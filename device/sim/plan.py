@@ -1,18 +1,21 @@
-"""Plan of a simulation: selection of the effects by their size eta.
+"""Plan of a simulation: selection of the effects by their size eta, alone and together.
 
-The rule (OPTICS.md 3.1): an effect that changes the reconstruction by less than a twentieth of its noise changes no
-picture (|dPCC| < 0.001 in every case of that table), and is skipped. Proof: tests/physics/test_plan_proof.py.
+The rule (OPTICS.md 3.1): a change of the reconstruction by less than a twentieth of its noise changes no picture
+(|dPCC| < 0.001 in every case of that table). The smallest effects are skipped as long as their joint eta stays below
+it. Proof: tests/physics/test_plan_proof.py for the shipped scenes, tests/physics/test_joint_plan.py for random ones.
 """
 
 import difflib
-from collections.abc import Collection, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from math import hypot
 from typing import NamedTuple
 
 from device.errors import SettingError
 from device.sim.effects.effect import Effect
 from device.sim.fundus import Fundus
 from device.sim.installed_effects import effects_of
-from device.sim.optical_setup import OpticalSetup, Scene
+from device.sim.optical_setup import OpticalSetup, Scene, Size
 from device.sim.sensor import SensorModel
 from device.values import SimulatedEffects
 
@@ -43,21 +46,48 @@ def decide(
 ) -> tuple[Decision, ...]:
     """Return the decision on every effect, in the order of the light path; nothing is rendered.
 
-    By default the effects with eta >= 0.05 are simulated. `everything` selects all effects, `only` just those named;
-    `without` excludes those named in every case. `effects`: those to decide; None: the built-in ones, then those of
-    plug-ins that the scene names. SettingError for `everything` with `only`, for a name that no effect has, or for a
-    plug-in that fails.
+    By default the smallest effects are skipped as long as their joint eta stays below 0.05, and the others simulated.
+    `everything` selects all effects, `only` just those named; `without` excludes those named in every case. `effects`:
+    those to decide; None: the built-in ones, then those of plug-ins that the scene names. SettingError for
+    `everything` with `only`, for a name that no effect has, or for a plug-in that fails.
     """
     if everything and only:
         raise SettingError("all effects and single ones cannot both be selected", "Give --all or --only, not both.")
     effects = effects_of(scene) if effects is None else effects
     _refuse_unknown_names([*only, *without], [effect.name for effect in effects])
+    sizes = [effect.size(scene) for effect in effects]
+    skipped = _negligible(sizes)
     decisions = []
-    for effect in effects:
-        eta, why = effect.size(scene)
-        chosen = everything or (effect.name in only if only else eta >= ETA_THRESHOLD)
-        decisions.append(Decision(effect, chosen and effect.name not in without, eta, why))
+    for place, (effect, size) in enumerate(zip(effects, sizes, strict=True)):
+        chosen = everything or (effect.name in only if only else place not in skipped)
+        decisions.append(Decision(effect, chosen and effect.name not in without, size.eta, size.why))
     return tuple(decisions)
+
+
+def joint_eta(sizes: Iterable[Size]) -> float:
+    """Return a bound of the joint eta of several effects.
+
+    Effects on one quantity (`Size.shared`) change the frame in the same direction: their etas add. Changes of different
+    quantities are taken as uncorrelated, so their squares add; OPTICS.md 3.1.
+    """
+    by_quantity: defaultdict[str, float] = defaultdict(float)
+    independent = []
+    for size in sizes:
+        if size.shared:
+            by_quantity[size.shared] += size.eta
+        else:
+            independent.append(size.eta)
+    return hypot(*independent, *by_quantity.values())
+
+
+def _negligible(sizes: Sequence[Size]) -> set[int]:
+    """Return the places of the effects that together change no picture: the smallest, up to a joint eta of 0.05."""
+    skipped: list[int] = []
+    for place in sorted(range(len(sizes)), key=lambda place: sizes[place].eta):
+        if joint_eta([sizes[other] for other in (*skipped, place)]) >= ETA_THRESHOLD:
+            break  # each further one is larger
+        skipped.append(place)
+    return set(skipped)
 
 
 def build_setup(scene: Scene, subject: Fundus, decisions: Sequence[Decision]) -> OpticalSetup:
@@ -87,8 +117,8 @@ def format_plan(decisions: Sequence[Decision], spent_ms: dict[str, float] | None
             f"{decision.why}"
         )
     lines.append(
-        f"eta: change of the picture over its noise; without --all, --only and --without, effects from "
-        f"{ETA_THRESHOLD:g} (1/20) on are simulated"
+        f"eta: change of the picture over its noise; without --all, --only and --without, the smallest effects are "
+        f"skipped up to a joint eta of {ETA_THRESHOLD:g} (1/20)"
     )
     return "\n".join(lines)
 

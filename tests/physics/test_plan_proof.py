@@ -10,18 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy import fft
 
 from device.clock import VirtualClock
 from device.config.head_file import load_head
 from device.recon.assessment.metrics import pcc
-from device.recon.methods import METHODS
 from device.recon.model.field_of_view import field_radius_px
-from device.recon.model.preprocessing import Preprocessor
 from device.recon.model.resolution import working_bin
 from device.recon.reconstructor import Recipe, Reconstructor
-from device.recon.solvers.tv import EvidenceWiener
 from device.sim.effects import EFFECTS
 from device.sim.effects.effect import Effect
 from device.sim.fundus import field_mask
@@ -32,50 +27,13 @@ from device.sim.simulated_calibration import calibration_point, simulated_calibr
 from device.sim.world import World
 from device.values import Calibration, Image
 from tests import scenes
+from tests.plan_filter import COARSER, Filter
 from tests.simulated import SCENES, coarse, expected_electrons, exposed_counts, with_keys, world
 
 pytestmark = pytest.mark.paper  # some minutes: every shipped scene is rendered both ways
 
-COARSER = 2
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 ROUNDING = 2e-3  # rounding error of single precision and one-electron counts at an exact zero
-
-
-class Filter:
-    """Linear step of the product: apodisation, spectrum, conj(H) / (|H|^2 + s2 / g), with the prior of one frame."""
-
-    def __init__(self, calibration: Calibration, of: World) -> None:
-        counts = exposed_counts(of)
-        method = METHODS["evidence"]
-        model = method.model(calibration, counts.shape, working_bin(calibration.psfs[0]), scenes.PLANNER, 0)
-        solver = method.build(model, calibration, scenes.PLANNER)
-        assert isinstance(solver, EvidenceWiener)
-        solver.start(Preprocessor(calibration, model.grid)(counts))
-        self.grid, self.fade = model.grid, solver.fade
-        self.gain = np.conj(model.otf) / (np.abs(model.otf) ** 2 + solver.detail.reg)
-        self.read_e = of.spec.camera.read_noise_e
-
-    def eta(self, with_it: NDArray[np.float64], without: NDArray[np.float64]) -> float:
-        """Return the change of the picture over its noise for this change of the frame's expected electrons."""
-        seen, ideal = self.binned(with_it), self.binned(without)
-        change = seen - (seen * ideal).sum() / (ideal * ideal).sum() * ideal
-        padded = np.zeros(self.grid.shape)
-        padded[self.grid.slices] = change * self.fade
-        changed = self.energy(fft.rfft2(padded) * self.gain)
-        noise = (ideal.mean() + (self.grid.n * self.read_e) ** 2) * float((self.fade**2).sum())
-        return float(np.sqrt(changed / (noise * self.energy(self.gain))))
-
-    def energy(self, spectrum: NDArray[np.complex128]) -> float:
-        """Return the sum of squares over the whole plane from a half spectrum."""
-        twice = np.full(spectrum.shape[1], 2.0)
-        twice[0] = 1
-        if self.grid.shape[1] % 2 == 0:
-            twice[-1] = 1
-        return float((np.abs(spectrum) ** 2 * twice).sum())
-
-    def binned(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
-        n, (rows, cols), (top, left) = self.grid.n, self.grid.window, self.grid.first_px
-        return image[top : top + n * rows, left : left + n * cols].reshape(rows, n, cols, n).sum((1, 3))
 
 
 @dataclass

@@ -8,7 +8,7 @@ from scipy import ndimage
 from device.optics import eye
 from device.optics.diffuser import Refraction
 from device.optics.illumination import LEDS, PEAK_UM
-from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
+from device.sim.optical_setup import MEAN_SPHERE, OpticalSetup, Place, Scene, Size
 from device.sim.render import azimuth_and_angle
 from device.values import Image
 
@@ -136,7 +136,9 @@ class RefractiveError:
         dpt = hypot(m, j0, j45)
         edge_um = dpt * scene.geometry.scale_per_dpt * scene.optics.iris_um / 2
         return Size(
-            _REFRACTION_ETA_PER_DPT * dpt * scene.weight, f"{dpt:.2f} dpt move the caustic's edge by {edge_um:.1f} um"
+            _REFRACTION_ETA_PER_DPT * dpt * scene.weight,
+            f"{dpt:.2f} dpt move the caustic's edge by {edge_um:.1f} um",
+            MEAN_SPHERE,
         )
 
     def apply(self, setup: OpticalSetup) -> None:
@@ -159,9 +161,8 @@ class FieldCurvature:
             return Size(0.0, "the surface follows the eye's focus")
         sagittal, tangential = curvature_dpt(scene, scene.half_field_deg)
         mean_dpt = (sagittal + tangential) / 4
-        return Size(
-            _CURVATURE_ETA_PER_DPT * mean_dpt * scene.weight, f"the edge is {sagittal:.1f} and {tangential:.1f} dpt off"
-        )
+        why = f"the edge is {sagittal:.1f} and {tangential:.1f} dpt off"
+        return Size(_CURVATURE_ETA_PER_DPT * mean_dpt * scene.weight, why, MEAN_SPHERE)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Register the additional refraction of each place: sphere and radial cylinder; zero for a curved surface."""
@@ -199,7 +200,7 @@ class Accommodation:
             return Size(0.0, "the eye is relaxed")
         demand_dpt = scene.sim.eye.fixation_dpt - scene.sim.eye.m_dpt
         why = f"{response_dpt:.2f} dpt for a demand of {demand_dpt:.2f} dpt"
-        return Size(_REFRACTION_ETA_PER_DPT * response_dpt * scene.weight, why)
+        return Size(_REFRACTION_ETA_PER_DPT * response_dpt * scene.weight, why, MEAN_SPHERE)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Add the response to the mean sphere of the setup's refraction."""
@@ -229,7 +230,7 @@ class ChromaticFocus:
             why = "the eye's refraction is that in green" if scene.colour == "green" else "there is no human eye"
             return Size(0.0, why)
         eta = _REFRACTION_ETA_PER_DPT * abs(difference_dpt) * scene.weight
-        return Size(eta, f"{difference_dpt:+.2f} dpt in {scene.colour} from green")
+        return Size(eta, f"{difference_dpt:+.2f} dpt in {scene.colour} from green", MEAN_SPHERE)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Add the difference to the mean sphere of the setup's refraction."""

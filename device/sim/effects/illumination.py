@@ -24,7 +24,7 @@ from device.optics.eye import iris_overlap
 from device.optics.illumination import LEDS
 from device.optics.led_cap import relative_intensity
 from device.optics.matrix import EMITTER_MM, geometry_of, led_positions_mm, ring
-from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
+from device.sim.optical_setup import CONSTANT_LIGHT, LIGHT_OVER_FIELD, OpticalSetup, Place, Scene, Size
 from device.values import Image
 
 STRAY_ETA_PER_SHARE = 320.0  # of the mean signal, where no constant is fitted; a solver that fits one sees less
@@ -46,7 +46,7 @@ class Penumbra:
             return Size(0.0, "the field has a sharp edge")
         left = float(relative_intensity(scene.cap, scene.optics.angular_magnification, scene.half_field_deg, 0.0))
         why = f"a die of {scene.cap.emitter_mm:g} mm: the field's edge gets {left:.2f} of the middle's light"
-        return Size(_FALLOFF_ETA * (1 - left) / _FALLOFF_TABLE_LOSS * scene.weight, why)
+        return Size(_FALLOFF_ETA * (1 - left) / _FALLOFF_TABLE_LOSS * scene.weight, why, LIGHT_OVER_FIELD)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Multiply the object, which is as wide as the light, by the intensity relative to that of the axis."""
@@ -81,6 +81,7 @@ class Falloff:
         return Size(
             _FALLOFF_ETA * loss / _FALLOFF_TABLE_LOSS * scene.weight,
             f"the field's edge gets {1 - loss:.2f} of the middle's light",
+            LIGHT_OVER_FIELD,
         )
 
     def apply(self, setup: OpticalSetup) -> None:
@@ -120,7 +121,7 @@ class Leds:
             f"the ring stands {light.ring_offset_um / 1000:g} mm off its place: "
             f"the field's light varies by {spread:.2%}"
         )
-        return Size(_LEDS_ETA_PER_SHARE * spread * scene.weight, why)
+        return Size(_LEDS_ETA_PER_SHARE * spread * scene.weight, why, LIGHT_OVER_FIELD)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Multiply the object by the share of the ring's light at each place; no change where the size is 0."""
@@ -202,7 +203,7 @@ class Stray:
     def size(self, scene: Scene) -> Size:
         """Return the effect's size eta, proportional to stray light over the mean signal."""
         share = scene.sim.light.stray
-        return Size(STRAY_ETA_PER_SHARE * share * scene.weight, f"{share:.2%} of the mean signal")
+        return Size(STRAY_ETA_PER_SHARE * share * scene.weight, f"{share:.2%} of the mean signal", CONSTANT_LIGHT)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Add a constant to every pixel while the lamp is on, as a share of the mean signal."""
@@ -220,7 +221,7 @@ class Ambient:
     def size(self, scene: Scene) -> Size:
         """Return the effect's size eta, proportional to ambient light over the mean signal."""
         share = scene.sim.light.ambient
-        return Size(STRAY_ETA_PER_SHARE * share * scene.weight, f"{share:.2%} of the mean signal")
+        return Size(STRAY_ETA_PER_SHARE * share * scene.weight, f"{share:.2%} of the mean signal", CONSTANT_LIGHT)
 
     def apply(self, setup: OpticalSetup) -> None:
         """Add a constant to every pixel of every frame, as a share of the lit frame's mean signal."""

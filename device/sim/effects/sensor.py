@@ -7,7 +7,7 @@ import numpy as np
 
 from device.sim.effects.eye import brightest_reflex
 from device.sim.effects.illumination import STRAY_ETA_PER_SHARE
-from device.sim.optical_setup import OpticalSetup, Scene, Size
+from device.sim.optical_setup import CONSTANT_LIGHT, OpticalSetup, Scene, Size
 from device.values import Mask
 
 _SHUTTER_ETA_PER_DEG = 12.0  # a skew moves vessels at the top and bottom edge against each other
@@ -101,7 +101,9 @@ class DarkCurrent:
         """Return the size eta of stray light with the same mean, before a dark frame is subtracted."""
         dark_e = scene.sim.sensor.dark_e_per_s * scene.spec.camera.exposure_s
         return Size(
-            STRAY_ETA_PER_SHARE * dark_e / scene.lit_e * scene.weight, f"{dark_e:.1f} electrons in one exposure"
+            STRAY_ETA_PER_SHARE * dark_e / scene.lit_e * scene.weight,
+            f"{dark_e:.1f} electrons in one exposure",
+            CONSTANT_LIGHT,
         )
 
     def apply(self, setup: OpticalSetup) -> None:
