@@ -254,7 +254,7 @@ class _CoarseField:
         )
         return replace(
             brightness,
-            through=1 - solver.stray / frame.mean_dn,
+            through=solver.diagnostics.quality["through"],
             coverage=solver.diagnostics.quality["coverage"],
             off_x=off_x,
             off_y=off_y,

@@ -7,6 +7,7 @@ that did not pass the diffuser. Without this fit a small sensor needs 160 solver
 
 from collections.abc import Iterator
 from math import factorial, isfinite
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,18 @@ DEGREE = 8
 BLOCK = 4  # the fit uses means of 4 x 4 samples: the modes are smooth
 RIDGE = 1e-4
 STRAY_RIDGE = 1e-2  # stronger: on a fully lit sensor the constant is nearly collinear with a mode
+
+
+class BlurredModes(NamedTuple):
+    """Blurred shading modes as means over blocks of n x n samples, (modes, blocks) float32, the even field first.
+
+    `weights` is that of each block under shot noise of an even field, (blocks,); `shape` counts the blocks.
+    """
+
+    modes: Image
+    weights: Image
+    shape: tuple[int, int]
+    n: int
 
 
 class Shading:
@@ -41,7 +54,7 @@ class Shading:
         for row, mode in zip(self._modes, modes(model) if known else [model.mask], strict=True):
             row[:] = mode[top:bottom, left:right].ravel()
             on_blocks.append(self._torus_of_blocks(mode))
-            seen.append(blocks(model.blur(mode)[model.grid.slices], self._block).ravel())
+            seen.append(blocks(model.blur(mode)[model.grid.slices], self.block).ravel())
         self._spectra = np.asarray(scipy_fft.rfft2(np.stack(on_blocks)), np.complex64)
         self._ridge = np.full(count + known, RIDGE)
         self._ridge[count:] = STRAY_RIDGE
@@ -65,7 +78,7 @@ class Shading:
         little with the PSF.
         """
         otf = self._model.otf
-        n = self._block
+        n = self.block
         rows, cols = (size // n for size in self._model.grid.shape)
         low = otf[np.fft.fftfreq(rows, 1 / rows).astype(int)][:, : cols // 2 + 1]
         high, wide = (size // n for size in self._model.grid.window)
@@ -73,14 +86,20 @@ class Shading:
         return seen.reshape(len(seen), -1)
 
     @property
-    def _block(self) -> int:
+    def blurred(self) -> "BlurredModes":
+        """Blurred modes and weights with the PSF of the last `refocus`."""
+        rows, cols = (size // self.block for size in self._model.grid.window)
+        return BlurredModes(self._seen[: len(self._modes)], self._weights, (rows, cols), self.block)
+
+    @property
+    def block(self) -> int:
         """Side of a block in samples: BLOCK if whole blocks fill the torus and fit into the window, else 1."""
         whole = all(size % BLOCK == 0 for size in self._model.grid.shape)
         return BLOCK if whole and min(self._model.grid.window) >= BLOCK else 1
 
     def _torus_of_blocks(self, mode: Image) -> Image:
         """Return the means over the blocks of the torus, counted from the window's corner."""
-        n = self._block
+        n = self.block
         (top, left) = self._model.grid.at
         rows, cols = (size // n for size in mode.shape)
         moved = np.roll(mode, (-top, -left), (0, 1))
@@ -89,8 +108,8 @@ class Shading:
     def _normal_equations(self, seen: Image) -> None:
         """Set up the weighted ridge regression with the weights of shot noise under an even field."""
         self._seen = seen
-        weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + 0.03)
-        self._weighted = np.asarray(seen * weights, np.float32)
+        self._weights = np.asarray(1 / (np.maximum(seen[0], 0) / seen[0].max() + 0.03), np.float32)
+        self._weighted = np.asarray(seen * self._weights, np.float32)
         self._inverse = self._inverted(self._weighted)
 
     def _inverted(self, weighted: Image) -> NDArray[np.float64]:
@@ -104,11 +123,7 @@ class Shading:
         The stray light is 0 without a known field. Missing samples have weight 0; otherwise the fit would follow the
         zeros in a gap.
         """
-        if frame.has_gaps:
-            coefficients = self._fit_with_gaps(frame)
-        else:
-            coefficients = self._inverse @ (self._weighted @ blocks(frame.y, self._block).ravel())
-        coefficients = coefficients.astype(np.float32)
+        coefficients = self._coefficients(frame)
         top, bottom, left, right = self.box
         out[:] = 0
         smooth = coefficients[: len(self._modes)] @ self._modes
@@ -116,14 +131,31 @@ class Shading:
         stray = float(coefficients[-1]) * self._stray_scale if len(coefficients) > len(self._modes) else 0.0
         return float(coefficients[0]), stray
 
+    def unexplained(self, frame: Linear, places: NDArray[np.intp]) -> Image:
+        """Return what the fit leaves of the means over these blocks, float32 (places,); 0 for missing blocks."""
+        share, means = block_means(frame, self.block)
+        left = means[places] - self._coefficients(frame) @ self._seen[:, places]
+        return np.asarray(left * (share[places] > 0), np.float32)
+
+    def _coefficients(self, frame: Linear) -> Image:
+        """Return the coefficients of the modes, the stray light last, float32."""
+        if frame.has_gaps:
+            return self._fit_with_gaps(frame).astype(np.float32)
+        return np.asarray(self._inverse @ (self._weighted @ blocks(frame.y, self.block).ravel()), np.float32)
+
     def _fit_with_gaps(self, frame: Linear) -> NDArray[np.float64]:
         """Return the coefficients, stray light last, with each block weighted by its share of good pixels."""
-        share = blocks(frame.good, self._block).ravel()
-        share[share < MIN_GOOD] = 0
-        light = blocks(frame.y * frame.good, self._block).ravel()
-        means = np.divide(light, share, out=np.zeros_like(light), where=share > 0)
+        share, means = block_means(frame, self.block)
         weighted = self._weighted * share
         return np.asarray(self._inverted(weighted) @ (weighted @ means), np.float64)
+
+
+def block_means(frame: Linear, n: int) -> tuple[Image, Image]:
+    """Return the good share of each n x n block of a frame and the mean of its good pixels, float32 (blocks,)."""
+    share = blocks(frame.good, n).ravel()
+    share[share < MIN_GOOD] = 0
+    light = blocks(frame.y * frame.good, n).ravel()
+    return share, np.divide(light, share, out=np.zeros_like(light), where=share > 0)
 
 
 def blocks(image: Image, n: int) -> Image:

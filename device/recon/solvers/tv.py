@@ -15,6 +15,7 @@ from math import isfinite
 import numpy as np
 
 from device.recon.assessment import quality_figures
+from device.recon.estimation.background import Background, without
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.estimation.power_law_prior import Fit, PowerLaw, PowerLawPrior
@@ -59,13 +60,15 @@ class EvidenceWiener:
         self.sensor = calibration.sensor
         self.geometry = calibration.geometry
         self.shading = Shading(model)
+        self.background = Background(self.shading, model.grid.n)
         self.prior = PowerLawPrior(model)
         self.sample = FrequencySample.of(model)
         self.fade = taper(model.grid.window, min(0.5, TAPER_PX / model.grid.n / min(model.grid.window)))
         self.x: Image = np.zeros(model.grid.shape, np.float32)
         self.blurred: Image = np.zeros(model.grid.shape, np.float32)
         self.diagnostics = Diagnostics()
-        self.level = self.stray = 0.0
+        self.level = 0.0
+        self.stray: Image = np.zeros((1, 1), np.float32)  # DN on the window, or one value for all of it
         self.detail = DetailSolution(Noise(0, 1), 1.0, np.ones(model.otf.shape, np.float32), PowerLaw(0, 2), 0.0)
         self.given: Settings = {}
 
@@ -84,11 +87,13 @@ class EvidenceWiener:
         model = self.model
         fft = self.model.fft
         inside = self.model.grid.slices
-        self.level, self.stray = self.shading.fit(frame, self.x)
+        uneven = self.background.fit(frame)
+        self.level, constant = self.shading.fit(without(frame, uneven), self.x)
+        self.stray = np.float32(constant) + (np.zeros((1, 1), np.float32) if uneven is None else uneven)
         self._blur()
         fft.space[:] = 0
         np.subtract(frame.y, self.blurred[inside], out=fft.space[inside])
-        fft.space[inside] -= np.float32(self.stray)
+        fft.space[inside] -= self.stray
         fft.space[inside] *= frame.good * self.fade
         has_gaps = frame.has_gaps
         left = fft.space[inside].copy() if has_gaps else self.fade
@@ -108,7 +113,7 @@ class EvidenceWiener:
                 "prior_slope": law.slope,
                 "prior_log_power": law.log_power,
                 "flat_dn": self.level,
-                "background_dn": self.stray,
+                "background_dn": float(self.stray.mean()),
             },
             quality=self._quality(fit, mean),
         )
@@ -173,7 +178,7 @@ class EvidenceWiener:
         return {
             "structure_nats": nats,
             "structure_sure": sure,
-            "through": 1 - self.stray / mean_dn if mean_dn > 0 else None,
+            "through": 1 - float(self.stray.mean()) / mean_dn if mean_dn > 0 else None,
             "coverage": None,
             "cutoff_per_px": limit.cycles_per_px,
             "resolution_um": limit.half_period_um,
@@ -258,7 +263,7 @@ class TotalVariation(EvidenceWiener):
         self.rho = max(RHO * self.tau / max(abs(self.level), 1e-12), 1e-30)  # a frame without light has no tau
         self.stiffness = STIFF * typical
         self._blur()
-        y = self._y = frame.y - np.float32(self.stray)
+        y = self._y = frame.y - self.stray
         self._good = frame.good
         fused_kernels.data_weights(
             self.blurred,

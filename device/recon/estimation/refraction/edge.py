@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon.estimation.background import SensorPolynomial, without
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import InterpolatedOtf, transform
 from device.recon.estimation.refraction.field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
@@ -99,6 +100,8 @@ class EdgeLikelihood:
         self.edge = self.prior.calibrated
         self.field = LitField(self.grid, self.edge, self.prior.largest_samples)
         self._sampled: SampledFrame
+        self._whole: Linear  # with its background
+        self._uneven: SensorPolynomial | None = None
         self._smooth: SmoothPart
         self._moved_objects: list[Spectrum] = []
         self.noise = Noise(0.0, 1.0)
@@ -106,10 +109,17 @@ class EdgeLikelihood:
         self.dithered_dn = 0.0
         self._noise_dn2 = 1.0
 
+    @property
+    def frame(self) -> Linear:
+        """Frame of the last `start`, without the background that the last `fit_smooth` found."""
+        return self._sampled.linear
+
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
         self._sampled = self.likelihood.frame(counts, dark, defects)
-        self.frame = self._sampled.linear
+        self._whole = self._sampled.linear
+        background = self.likelihood.background
+        self._uneven = None if background.polynomial(self._whole) is None else background.highest
         self._is_rounded = _is_rounded(counts)
         self.edge = self.prior.calibrated
         return self.frame
@@ -126,7 +136,8 @@ class EdgeLikelihood:
         """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
         stretch = transform(self.likelihood.geometry, *eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(self.grid.shape, self.grid.n, stretch)
-        smooth = self.field.fit(self.frame, otf, self.edge)
+        smooth = self.field.fit(self._whole, otf, self.edge, self._uneven)
+        self._sampled = replace(self._sampled, linear=without(self._whole, smooth.background))
         self._smooth = self.likelihood.smooth_part(self._sampled, smooth.image, otf, smooth.level_dn, smooth.stray_dn)
         self._moved_objects = [self.likelihood.object_spectrum(image) for image in smooth.derivatives]
         return smooth.level_dn

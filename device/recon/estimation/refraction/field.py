@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft as scipy_fft
 
-from device.recon.estimation.shading import BLOCK, RIDGE, STRAY_RIDGE, blocks, zernike_modes
+from device.recon.estimation.background import SensorPolynomial, joint_background, without
+from device.recon.estimation.shading import BLOCK, RIDGE, STRAY_RIDGE, block_means, zernike_modes
 from device.recon.model.fft_plans import Spectrum
 from device.recon.model.grid import Grid
-from device.recon.model.preprocessing import MIN_GOOD, Linear
+from device.recon.model.preprocessing import Linear
 from device.values import Image
 
 MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radius and of half the width
@@ -123,13 +124,15 @@ class EdgePrior:
 class SmoothField:
     """Smooth part of one frame: object on the grid, its derivatives with respect to the edge, level and stray light.
 
-    `level_dn` is the mean level, `stray_dn` the light that did not pass the diffuser.
+    `level_dn` is the mean level, `stray_dn` the light that did not pass the diffuser, and `background` its part that is
+    uneven, in DN on the window; None: not fitted.
     """
 
     image: Image
     derivatives: tuple[Image, ...]
     level_dn: float
     stray_dn: float
+    background: Image | None
 
 
 class LitField:
@@ -159,14 +162,19 @@ class LitField:
         self._by_block = self._modes.reshape(len(self._modes), sizes[0] // BLOCK, BLOCK, sizes[1] // BLOCK, BLOCK)
         self._even_means = self._by_block.mean(axis=(2, 4))
 
-    def fit(self, frame: Linear, otf: Spectrum, edge: Edge) -> SmoothField:
-        """Return the smooth part of a frame within an edge, for the PSF with this OTF on the grid."""
+    def fit(self, frame: Linear, otf: Spectrum, edge: Edge, uneven: SensorPolynomial | None = None) -> SmoothField:
+        """Return the smooth part of a frame within an edge, for the PSF with this OTF on the grid.
+
+        `uneven`: polynomial of the background that is fitted with it; None: a constant only.
+        """
         light = edge.light(self._rows, self._cols)
-        coefficients, stray_dn = _ridge_fit(frame, self._blurred_modes(otf, light))
+        seen = self._blurred_modes(otf, light)
+        background = None if uneven is None else joint_background(frame, seen, _weights(seen), uneven, RIDGE)
+        coefficients, stray_dn = _ridge_fit(without(frame, background), seen)
         smooth = (coefficients[: len(self._modes)].astype(np.float32) @ self._modes).reshape(light.shape)
         images = [smooth * part for part in (light, *edge.derivatives(self._rows, self._cols))]
         first, *others = (self._on_grid(image) for image in images)
-        return SmoothField(first, tuple(others), float(coefficients[0]), stray_dn)
+        return SmoothField(first, tuple(others), float(coefficients[0]), stray_dn, background)
 
     def _on_grid(self, image: Image) -> Image:
         whole = np.zeros(self._grid.shape, np.float32)
@@ -194,6 +202,11 @@ class LitField:
         return np.ascontiguousarray(seen.reshape(len(means), -1))
 
 
+def _weights(seen: Image) -> Image:
+    """Return the weights of the blocks under shot noise of an even field, `seen[0]`, float32 (blocks,)."""
+    return np.asarray(1 / (np.maximum(seen[0], 0) / seen[0].max() + MIN_WEIGHT), np.float32)
+
+
 def _ridge_fit(frame: Linear, seen: Image) -> tuple[Floats, float]:
     """Return the coefficients of the modes `seen` (modes, blocks), and the stray light in DN.
 
@@ -201,11 +214,8 @@ def _ridge_fit(frame: Linear, seen: Image) -> tuple[Floats, float]:
     """
     brightest = float(seen[0].max())
     every = np.vstack([seen, np.full_like(seen[:1], brightest)])
-    share = blocks(frame.good, BLOCK).ravel()
-    share[share < MIN_GOOD] = 0
-    light = blocks(frame.y * frame.good, BLOCK).ravel()
-    means = np.divide(light, share, out=np.zeros_like(light), where=share > 0)
-    weighted = every * (share / (np.maximum(seen[0], 0) / brightest + MIN_WEIGHT))
+    share, means = block_means(frame, BLOCK)
+    weighted = every * (share * _weights(seen))
     normal = (weighted @ every.T).astype(np.float64)
     ridge = np.full(len(every), RIDGE)
     ridge[-1] = STRAY_RIDGE
