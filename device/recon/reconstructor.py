@@ -587,6 +587,8 @@ class Reconstructor:
         cost_s = find_s + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
         if run.fits(cost_s):
             with_cylinder = run.fits(cost_s + self._cylinder_s)
+            if not with_cylinder:
+                self._cylinder_cost.halve_maximum()
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
             assert task is not None
             if others and run.deadline is None:
@@ -598,6 +600,7 @@ class Reconstructor:
             eye = best.psf_wavefront if isinstance(best, Refraction) else None
         else:
             self._refocus_cost.halve_maximum()
+            self._find_cost.halve_maximum()
         self._refocus(eye)
         run.refraction_s = self.clock.now_s() - begin_s - run.cylinder_s
         return task

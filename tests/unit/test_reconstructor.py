@@ -11,13 +11,16 @@ import pyfftw
 import pytest
 
 from device.clock import Deadline, VirtualClock
+from device.config.head_file import load_head
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import Grid
 from device.recon.reconstructor import Recipe, Reconstructor, RoundDone, StageResult
 from device.recon.solvers.solver import Solver
+from device.sim.simulated_calibration import simulated_calibration
 from device.values import Image, Reconstruction
 from tests import scenes
+from tests.simulated import SCENES, coarse, exposed_counts, world
 
 SHAPE = (96, 128)
 QUICK, FULL = Recipe("gradient", 4), Recipe("gradient", 1)
@@ -202,6 +205,28 @@ def test_one_slow_run_does_not_refuse_the_stage_forever() -> None:
     bins = [reconstruct(counts(), deadline=Deadline.after(clock, 1.0)).report.bin for _ in range(15)]
     assert bins[0] == 4
     assert bins[-1] == 1
+
+
+class StallingClock(VirtualClock):
+    """Virtual clock in which every reading takes two seconds while the machine is busy, else none."""
+
+    busy = True
+
+    def now_s(self) -> float:
+        self.elapsed_s += 2.0 if self.busy else 0.0
+        return self.elapsed_s
+
+
+def test_one_slow_search_does_not_refuse_the_refraction_forever() -> None:
+    clock = StallingClock()
+    of = world(coarse(load_head(SCENES / "short_sighted.toml"), 4))
+    frame = exposed_counts(of)
+    reconstruct = Reconstructor(simulated_calibration(of), of.shape, scenes.PLANNER, clock, timed=False)
+    assert reconstruct(frame).report.refraction_dpt is not None
+    clock.busy = False
+    found = [reconstruct(frame, deadline=Deadline.after(clock, 1.0)).report.refraction_dpt for _ in range(24)]
+    assert found[0] is None
+    assert found[-1] is not None
 
 
 PRINT_COMPILED_SIGNATURES = """
