@@ -599,8 +599,7 @@ class Reconstructor:
             best = run.refraction if isinstance(run.refraction, Refraction) else task.best()
             eye = best.psf_wavefront if isinstance(best, Refraction) else None
         else:
-            self._refocus_cost.halve_maximum()
-            self._find_cost.halve_maximum()
+            max(self._find_cost, self._refocus_cost, key=lambda cost: cost.seconds).halve_maximum()
         self._refocus(eye)
         run.refraction_s = self.clock.now_s() - begin_s - run.cylinder_s
         return task

@@ -5,6 +5,7 @@ is passed on as values, from `frame` by `fit_smooth` and `residual` to the likel
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,8 +188,6 @@ class RefractionLikelihood:
         self.taper = taper(window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(window))))
         self.bands = SearchBands.of(window, n, self.interpolated_otf)
         self._otf = np.zeros(self.model.otf.shape, np.complex64)
-        self._shading = Shading(self.model)
-        self.background = Background(self._shading, self.grid.n)
 
     @property
     def grid(self) -> Grid:
@@ -198,6 +197,15 @@ class RefractionLikelihood:
     def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
         """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
         return self.interpolated_otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
+
+    @cached_property
+    def _shading(self) -> Shading:
+        return Shading(self.model)
+
+    @cached_property
+    def background(self) -> Background:
+        """Search for an uneven background in frames on these samples."""
+        return Background(self._shading, self.grid.n)
 
     def frame(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> SampledFrame:
         """Return the frame on this model's samples, with the weight of each."""
