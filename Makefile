@@ -106,16 +106,19 @@ FAULTS := tests/hard tests/physics tests/property
 INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibration_session.py test_calibration_monitor.py test_calibration_faults.py \
 	test_calibrate_command.py test_calibrations_command.py test_interrupted_press.py \
 	test_accuracy_explorer.py test_backup_page.py test_shutdown.py test_upload.py \
-	test_store_refusal_after_light.py test_visit_montage.py test_visit_export.py test_visit_colour.py \
+	test_store_refusal_after_light.py test_visit_export.py test_visit_colour.py \
 	test_reconstruct_burst.py test_updates.py test_openapi.py test_cli_server.py test_core_installation.py \
 	test_frontier.py) \
-	$(addprefix tests/unit/,test_calibration_sequence.py test_calibration_measurements.py test_head_check.py test_trial_lenses.py \
-	test_damaged_rows.py test_montage.py test_backup.py test_effects.py test_scene_files.py \
+	$(addprefix tests/unit/,test_calibration_measurements.py test_head_check.py test_trial_lenses.py \
+	test_damaged_rows.py test_backup.py test_effects.py test_scene_files.py \
 	test_paper_report.py)
-# Minutes each: 1,250 damages, of which `make test` has a sample; an optic that no head has; the maker's chart; guided
-# calibrations, updates and hasty fingers on the page, whose server side `make test-faults` tries.
-LONG := $(addprefix tests/,hard/test_store_damage.py physics/test_lenslets.py unit/test_model_eye.py \
-	browser/test_calibration_wizard.py browser/test_software_update.py browser/test_capture_edge_cases.py)
+# Minutes each: 1,250 damages, of which `make test` has a sample; an optic that no head has; the maker's chart; hard frames
+# of several eyes, of which `make test-faults` has the grid; montages; guided calibrations, updates, hasty fingers and every
+# alert in every language on the page, whose server side `make test-faults` tries.
+LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_full_field.py hard/test_quality.py hard/test_background.py \
+	physics/test_lenslets.py unit/test_model_eye.py unit/test_calibration_sequence.py unit/test_montage.py \
+	journey/test_visit_montage.py browser/test_calibration_wizard.py browser/test_software_update.py \
+	browser/test_capture_edge_cases.py browser/test_alerts.py browser/test_instrument_faults.py)
 NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
 # Workers take file after file in the order given: what takes long comes first, so that no worker begins it when the
 # others end. pytest drops a file that is named beside its folder, so that each is named once.
@@ -141,7 +144,7 @@ test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad fr
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
 	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR $(LONG_PAGES) $(filter-out $(LONG_PAGES) $(LONG) $(JOURNEYS),$(call tests_of,tests/browser))
 
-test-long: .venv/kernels browser strace ## Try 1,250 damages of a store, lenslets, the maker's chart, guided calibrations and updates on the page.
+test-long: .venv/kernels browser strace ## Try 1,250 damages of a store, lenslets, hard frames of several eyes, montages, every alert, guided calibrations on the page.
 	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(LONG)
 
 page-pictures: .venv/ready browser ## Take README's two pictures of the page again, on the real server with the simulated head.
