@@ -21,11 +21,11 @@ DEGREE = 6  # of the polynomial; a Gaussian in a corner, of a quarter of the sen
 MIN_UNLIT = 0.05  # share of the sensor outside the lit disc
 UNLIT = 0.02  # of the brightest place: the disc's edge
 GUARD_PX = 16  # outside of it: the edge of the caustic moves by 0.054 mm in an eye of 10 dpt
-UNEVEN = 0.7  # of what a constant leaves of the unlit blocks: clean frames up to 0.5, a gradient of 1 % of the mean 0.9
+UNEVEN = (
+    0.7  # of what a constant leaves of the unlit blocks: clean frames up to 0.65, a gradient of 1 % of the mean 0.87
+)
 ENOUGH_RMS = 0.0003  # of the mean light: what a polynomial may leave of the unlit blocks
 MIN_RMS = 0.0012  # of the mean light, that of a gradient of 0.4 %, which changes no picture; clean frames up to 0.0008
-
-
 RIDGES = np.array([1e-4, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2])  # by degree: a high one may peak under the disc
 
 
