@@ -198,7 +198,6 @@ class BurstJoiner:
         near = np.maximum(ndimage.gaussian_filter(field, SMOOTH_PX / self._stage.grid.n), 0.05)
         good = reference.good.astype(np.float32)
         base, base_scale = self._smooth(reference, good, field, near)
-        detail = np.empty(self._shape, np.float32)
         joined = np.zeros(self._shape, np.float32)
         weights = np.zeros(self._shape, np.float32)
         for k in used:
@@ -207,6 +206,7 @@ class BurstJoiner:
             assert shift is not None
             good[:] = frame.good
             smooth, scale = (base, base_scale) if frame is reference else self._smooth(frame, good, field, near)
+            detail = np.empty_like(base) if frame is reference else smooth  # in its place: `base` is needed at the end
             kernels.subtract_scaled(frame.light_dn, smooth, scale, good, detail)
             add_moved_back(detail, good, shift, shares[k], reference.mean_dn / frame.mean_dn, joined, weights)
         kernels.finish_mean(joined, weights, MIN_WEIGHT, base, base_scale)
