@@ -6,18 +6,28 @@ picture and its report are in DN of one exposure, that of the reference (`in_one
 """
 
 from collections import deque
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
 
 from device.clock import Deadline
+from device.recon.assessment.quality_figures import is_banded
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame, require_light
 from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import DurationEstimate, EyePsf, QuickLook, Reconstructor, RoundDone, Step, noise_frame
+from device.recon.reconstructor import (
+    DurationEstimate,
+    EyePsf,
+    QuickLook,
+    Reconstructor,
+    RoundDone,
+    Step,
+    noise_frame,
+    steadier,
+)
 from device.values import FrameUse, Reconstruction
 
 NO_TIME = "the time budget left no time to join the burst"
@@ -195,17 +205,52 @@ class BurstReconstructor:
             uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, reasons.get(k)) for k in range(len(frames))]
             yield from run.solve_one(frames[0], dark, uses, 0, simulated, tasks.get(0), looks[0])
             return
-        if joined is None:
+        made = yield from self._solve(run, frames, dark, unusable, ready, looks, simulated)
+        quality = made.report.quality
+        cost_s = self._cost_s(frames, (), unusable) + sum(made.report.seconds.values())
+        if (is_banded(quality) or "flicker" in quality) and run.fits(cost_s):
+            found = [self.single.flicker(frame, dark) for frame in frames]
+            flickers = [frame.flicker for frame in found if frame is not None]
+            if flickers:
+                steady = [own if new is None else new.counts for own, new in zip(frames, found, strict=True)]
+                looks = {0: self.single.quick_look(steady[0], dark)}
+                again = yield from self._solve(
+                    _Run(self, run.deadline, eye_psf), steady, dark, unusable, {}, looks, simulated
+                )
+                made = steadier(made, again, max(flickers))
+        yield made
+
+    def _solve(
+        self,
+        run: "_Run",
+        frames: Sequence[Pixels],
+        dark: Pixels | None,
+        unusable: Mapping[int, str] | None,
+        ready: Mapping[int, PreparedFrame],
+        looks: Mapping[int, QuickLook],
+        simulated: bool,
+    ) -> Generator[Step, None, Reconstruction]:
+        """Join the frames, unless the run has them joined; yield the steps before their picture, and return it.
+
+        `looks` has that of the first frame; other arguments as for `steps`.
+        """
+        if run.joined is None:
             yield from run.join(frames, dark, unusable, _seen(ready))
         assert run.joined is not None
         uses = run.joined.frames
         used = [use.index for use in uses if use.used]
-        known = tasks.get(used[0]), looks.get(used[0])
+        task = ready[used[0]].refraction if used[0] in ready else None
+        known = task, looks.get(used[0])
         if len(used) == 1:
-            yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated, *known)
+            steps = run.solve_one(frames[used[0]], dark, uses, used[0], simulated, *known)
         else:
             saturated = looks[0].solved.frame.saturated
-            yield from run.solve_joined([frames[k] for k in used], dark, saturated, simulated, *known)
+            steps = run.solve_joined([frames[k] for k in used], dark, saturated, simulated, *known)
+        for step in steps:
+            if isinstance(step, Reconstruction):
+                return step
+            yield step
+        raise AssertionError("a reconstruction ends with a picture")
 
     def join(
         self,
@@ -263,13 +308,13 @@ class _Run:
         eye_psf: EyePsf = EyePsf.ESTIMATED,
         joined: JoinedFrame | None = None,
     ) -> None:
-        self._owner, self._deadline, self._eye_psf = owner, deadline, eye_psf
+        self._owner, self.deadline, self._eye_psf = owner, deadline, eye_psf
         self.joined = joined
         self._join_s = 0.0
 
     def fits(self, cost_s: float) -> bool:
         """Return True if a step of `cost_s` seconds fits into the time left, or if there is no deadline."""
-        return self._deadline is None or self._deadline.fits(cost_s)
+        return self.deadline is None or self.deadline.fits(cost_s)
 
     def join(
         self,
@@ -291,7 +336,7 @@ class _Run:
             owner.see_cost.add(paused_s - begin_s)
             yield step
             begin_s = owner.clock.now_s()
-            self._deadline = None if self._deadline is None else self._deadline.later(begin_s - paused_s)
+            self.deadline = None if self.deadline is None else self.deadline.later(begin_s - paused_s)
 
     def solve_joined(
         self,
@@ -312,7 +357,7 @@ class _Run:
             used[0],
             dark,
             simulated=simulated,
-            deadline=self._deadline,
+            deadline=self.deadline,
             joined=total,
             eye_psf=self._eye_psf,
             refraction=refraction,
@@ -349,7 +394,7 @@ class _Run:
             counts,
             dark,
             simulated=simulated,
-            deadline=self._deadline,
+            deadline=self.deadline,
             eye_psf=self._eye_psf,
             refraction=refraction,
             look=look,

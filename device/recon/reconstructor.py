@@ -6,7 +6,7 @@ only if its measured cost fits into the time that is left.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -22,6 +22,7 @@ from device.recon.assessment.quality_figures import (
     NO_SIGNAL,
     PSF_FIGURES,
     Audience,
+    is_banded,
     is_explained,
     is_lit,
     is_measured,
@@ -30,6 +31,7 @@ from device.recon.assessment.quality_figures import (
     quality_warnings,
 )
 from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.estimation.flicker import FlickerFinder
 from device.recon.estimation.power_law_prior import PowerLaw
 from device.recon.estimation.psf_gain import PsfGain
 from device.recon.estimation.psf_warp import Wavefront
@@ -51,7 +53,7 @@ from device.recon.model.preprocessing import Linear, Preprocessor
 from device.recon.model.resampling import to_sensor
 from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, working_bin
 from device.recon.solvers.solver import Diagnostics, Solver
-from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
+from device.values import Calibration, Image, Reconstruction, RefractionOffset, Report, check_image_shape
 
 Check = Future[Consistency | None]
 CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
@@ -336,6 +338,7 @@ class Reconstructor:
                 for recipe in recipes
             ]
             self.defects = DefectFinder(calibration, shape, psf_index)
+        self.flicker = FlickerFinder(self.defects.dark, calibration.sensor.white_dn)
         self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
         self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
@@ -463,25 +466,40 @@ class Reconstructor:
         FrameError
             The frame has another shape than the sensor, or too many pixels are missing (`Preprocessor`).
         """
+        asked = _Asked(simulated, quick, joined, eye_psf)
         run = _Run(self, counts, dark, deadline, rounds)
-        task = refraction
+        begin_s = self.clock.now_s()
+        made = yield from self._solve(run, asked, _Known(refraction, others, look))
+        solving_s = self.clock.now_s() - begin_s - run.between_s
+        has_residual = made.report.residual is not None  # a closed form cannot tell whether another frame fits better
+        if joined is None and has_residual and is_banded(made.report.quality) and run.fits(solving_s):
+            steady = self.flicker(counts, dark)
+            if steady is not None:
+                run = _Run(self, steady.counts, dark, run.deadline, rounds)
+                again = yield from self._solve(run, asked, _Known())
+                made = steadier(made, again, steady.flicker)
+        yield made
+
+    def _solve(self, run: "_Run", asked: "_Asked", known: "_Known") -> Generator[Step, None, Reconstruction]:
+        """Yield the steps before the picture, and return the picture."""
+        task = known.refraction
         check: Check | None = None
         begin_s = self.clock.now_s()
-        stages = self.stages[:1] if quick else self.stages
-        if look is not None and len(stages) > 1:
-            run.begin_with(stages[0], look)
-            yield look.stage
+        stages = self.stages[:1] if asked.quick else self.stages
+        if known.look is not None and len(stages) > 1:
+            run.begin_with(stages[0], known.look)
+            yield known.look.stage
             stages = stages[1:]
         for stage in stages:
-            if stage is self._refracted[0] and not quick and eye_psf is EyePsf.ESTIMATED:
-                task = self._estimate_refraction(run, task, others)
-            elif stage is self._refracted[0] and eye_psf is EyePsf.STORED:
+            if stage is self._refracted[0] and not asked.quick and asked.eye_psf is EyePsf.ESTIMATED:
+                task = self._estimate_refraction(run, task, known.others)
+            elif stage is self._refracted[0] and asked.eye_psf is EyePsf.STORED:
                 self._refocus(None)
             if not run.has_time_for(stage):
                 break
             check = self._begin_check(run, stage)
             pauses = stage is self.stages[-1] and len(self.stages) > 1
-            yield from run.solve(stage, pauses, None if stage is self.stages[0] else joined)
+            yield from run.solve(stage, pauses, None if stage is self.stages[0] else asked.joined)
             if check is not None:
                 wait([check])
             yield StageResult(stage.recipe, stage.shown, last=stage is self.stages[-1])
@@ -495,7 +513,7 @@ class Reconstructor:
             self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
         if isinstance(run.refraction, Refraction) or run.cylinder_s > 0:
             seconds["cylinder"] = run.cylinder_s
-        yield Reconstruction(picture, self._report(run, seconds, check), simulated)
+        return Reconstruction(picture, self._report(run, seconds, check), asked.simulated)
 
     def quick_look(self, counts: Pixels, dark: Pixels | None = None) -> QuickLook:
         """Return the first stage of a frame, for `steps` of this frame.
@@ -637,6 +655,8 @@ class Reconstructor:
         diagnostics = run.solved.diagnostics
         dark = not run.solved.has_light
         quality = run.solved.quality
+        if run.done.is_closed_form and len(self.stages) == 1:  # no residual, which would show bands: the row means do
+            quality["banding"] = _flicker_of_rows(self.flicker, run)
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
         psf_scale = self._psf_scale(run.eye)
         match = psf_match(quality)
@@ -647,7 +667,7 @@ class Reconstructor:
         snr = light_over_noise(run.solved.frame.mean_dn, noise_dn, self.shape) if self.calibration.geometry else None
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience, snr)
         explained = not dark and is_explained(quality, match, misfit)
-        eye = self._reported_refraction(run.refraction, explained and is_lit(quality))
+        eye = _reported_refraction(run.refraction, explained and is_lit(quality), self.calibration.refraction_offset)
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }
@@ -671,14 +691,6 @@ class Reconstructor:
             warnings=warnings,
         )
 
-    def _reported_refraction(
-        self, eye: Refraction | NoRefraction | None, explained: bool
-    ) -> Refraction | NoRefraction | None:
-        """Return the refraction that the report states: corrected, or refused for a frame that is not explained."""
-        if eye is not None and not explained:
-            return NoRefraction("the forward model does not explain the frame")
-        return corrected(eye, self.calibration.refraction_offset) if isinstance(eye, Refraction) else eye
-
     def _psf_cylinder(self, run: "_Run") -> dict[str, float | None] | None:
         """Return `psf_cylinder` of the report: the cylinder of the picture's PSF, and its gain if it is predicted."""
         eye = run.eye
@@ -697,12 +709,63 @@ class Reconstructor:
         return {"j0_dpt": -eye.j0_dpt, "j45_dpt": eye.j45_dpt, "gain_db": gain_db}
 
 
+def _reported_refraction(
+    eye: Refraction | NoRefraction | None, explained: bool, offset: RefractionOffset | None
+) -> Refraction | NoRefraction | None:
+    """Return the refraction that the report states: corrected, or refused for a frame that is not explained."""
+    if eye is not None and not explained:
+        return NoRefraction("the forward model does not explain the frame")
+    return corrected(eye, offset) if isinstance(eye, Refraction) else eye
+
+
+def _flicker_of_rows(finder: FlickerFinder, run: "_Run") -> float:
+    counts, dark, _ = run.brightest()
+    steady = finder(counts, dark)
+    return 0.0 if steady is None else steady.flicker
+
+
+def steadier(made: Reconstruction, again: Reconstruction, flicker: float) -> Reconstruction:
+    """Return the picture of frames without their flicker if the forward model explains that one better, else `made`.
+
+    A pattern of horizontal lines in the object looks like flicker, but the forward model explains it. A burst whose
+    frames did not match each other is explained better if more of them do.
+    """
+    before, after = made.report.residual, again.report.residual
+    if before is None or after is None:
+        return made
+    used = [sum(use.used for use in one.report.frames) for one in (made, again)]
+    if after >= before and (used[1] <= used[0] or is_banded(again.report.quality)):
+        return made
+    report = again.report
+    seconds = report.seconds | {"solve": made.report.seconds["solve"] + report.seconds["solve"]}
+    return replace(again, report=replace(report, seconds=seconds, quality=report.quality | {"flicker": flicker}))
+
+
 def _checked_match(figures: Consistency | None, quality: dict[str, float | None]) -> Match:
     """Return whether frame and PSF match, and add the figures of the consistency check to `quality`."""
     if figures is None:
         return Match.UNKNOWN
     quality |= figures.report_figures
     return figures.match
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What `Reconstructor.steps` was asked for, beside the frame."""
+
+    simulated: bool
+    quick: bool
+    joined: Image | None
+    eye_psf: EyePsf
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is known of a frame before it is solved."""
+
+    refraction: RefractionTask | None = None
+    others: Sequence[Pixels] = ()
+    look: QuickLook | None = None
 
 
 class _Run:

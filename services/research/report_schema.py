@@ -82,7 +82,11 @@ QUALITY: Mapping[str, str] = {
         "Above 0 the frame came through this PSF; near 0 nothing is known."
     ),
     "structure_sure": "`structure_nats` in units of its standard error; below -3 the frame came through another PSF.",
-    "banding": "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered.",
+    "flicker": "Rms of the gains of the rows, minus 1, that were taken out of the frame; absent without flicker.",
+    "banding": (
+        "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered. Of a closed "
+        "form: rms of the periodic gain of the rows."
+    ),
     "psf_score": "How far the spectrum of the frame follows that of the PSF: 1 exactly, 0 for another diffuser's.",
     "psf_score_sd": "Standard deviation of `psf_score`.",
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",

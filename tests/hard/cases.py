@@ -36,7 +36,7 @@ DIM = {"all": "Shot noise: with so few electrons no method has the detail; the r
 BLURRED = {"all": "The blur of the motion is in the object: one frame cannot tell it from a smooth eye."}
 BANDS = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"),
-    "Closed forms have no test of flicker: bands along the rows look like shading.",
+    "A closed form has no residual that would tell bands of the lamp from lines of the object: it only reports them.",
 )
 NO_TEST = dict.fromkeys(("tikhonov", "gradient"), "This closed form has no test of the PSF; the default has one.")
 PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
@@ -97,6 +97,11 @@ def flicker(share: float) -> Build:
     The flicker is sinusoidal (100 Hz), and the rows are read in 32 ms.
     """
     return lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, share))
+
+
+def bands(share: float) -> Build:
+    """Return the builder of a frame with bands of +- `share` (rolling shutter, LEDs dimmed by pulses at 400 Hz)."""
+    return lambda eye: eye.clean.with_raw(defects.bands(eye.clean.raw, eye.spec.camera, share))
 
 
 def gain(factor: float) -> Build:
@@ -228,6 +233,7 @@ CASES: tuple[Case, ...] = (
     *(_case(f"stray light {share:.0%}", "light", stray(share), "eye bright", PEDESTAL) for share in (0.2, 1.0)),
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
+    *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),

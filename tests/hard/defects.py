@@ -17,6 +17,7 @@ ROWS_AT = (0.36, 0.61)  # of the height
 WIDE = 3 / 1080  # of the rows: width of a group of dead columns or rows
 BLOB_AT, BLOB_SHARE = (0.45, 0.56), 0.055  # 60 of 1080 rows
 GLARE_AT, GLARE_SIGMA = (0.42, 0.57), 0.022
+PWM_HZ = 400.0  # of dimmed LEDs
 FLICKER_HZ, READ_S = 100.0, 0.032  # mains light, and a rolling shutter's time from the first row to the last
 
 
@@ -82,6 +83,17 @@ def glare(counts: Counts, camera: CameraSpec, share: float) -> Counts:
 def flicker(counts: Counts, camera: CameraSpec, share: float) -> Counts:
     """Multiply the light above black by 1 + `share` sin(2 pi FLICKER_HZ t), with t = 0 to READ_S over the rows."""
     swing = 1 + share * np.sin(2 * np.pi * FLICKER_HZ * READ_S * np.linspace(0, 1, counts.shape[0]))
+    return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
+
+
+def bands(counts: Counts, camera: CameraSpec, share: float, phase: float = 0.3) -> Counts:
+    """Multiply the light above black by 1 +- `share`, a triangle of PWM_HZ over the rows; `phase` in periods.
+
+    So a rolling shutter sees LEDs that are dimmed by pulses of half a period, in an exposure of half a period more than
+    whole ones.
+    """
+    periods = PWM_HZ * READ_S * np.linspace(0, 1, counts.shape[0]) + phase
+    swing = 1 + share * (1 - 4 * np.abs(periods % 1 - 0.5))
     return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
 
 

@@ -131,15 +131,18 @@ def _line(level: NDArray[np.float64], variance: NDArray[np.float64]) -> tuple[fl
 
 
 class DefectFinder:
-    """Search for defective pixels in the frames of one calibration: its black level, white level, noise and PSF."""
+    """Search for defective pixels in the frames of one calibration: its black level, white level, noise and PSF.
+
+    `dark` is its dark frame, (rows, cols), or its black level, (1, cols), float32 DN.
+    """
 
     def __init__(self, calibration: Calibration, shape: tuple[int, int], index: int = 0) -> None:
         sensor = calibration.sensor
         self._white_dn = sensor.white_dn
-        self._dark: Image = np.full((1, shape[1]), sensor.black_dn, np.float32)
+        self.dark: Image = np.full((1, shape[1]), sensor.black_dn, np.float32)
         if calibration.dark_dn is not None and calibration.dark_dn.shape == shape:
-            self._dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
-        self._dark = read_only(self._dark)
+            self.dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
+        self.dark = read_only(self.dark)
         gain = sensor.gain_e_per_dn
         read_e = sensor.read_noise_e or 0.0
         self._least_noise = (
@@ -161,7 +164,7 @@ class DefectFinder:
         calibration's.
         """
         counts = require_shape("frame", counts, self._shape)
-        offset = self._dark if dark is None else require_shape("dark frame", np.asarray(dark, np.float32), self._shape)
+        offset = self.dark if dark is None else require_shape("dark frame", np.asarray(dark, np.float32), self._shape)
         noise = self._least_noise
         found = FEW + 1
         if noise.floor_dn2 > 0:
@@ -208,7 +211,7 @@ class DefectFinder:
         self, counts: Pixels, dark: Pixels | None, noise: PixelNoise, defective: Mask, gap: bool, saturated: bool
     ) -> None:
         """Mark clipped areas, gaps and halos in `defective`, which holds the single pixels."""
-        offset = self._dark if dark is None else np.asarray(dark, np.float32)
+        offset = self.dark if dark is None else np.asarray(dark, np.float32)
         if saturated:
             white_light_dn = self._white_dn - float(offset.mean(dtype=np.float64))
             noise_dn = (noise.per_dn * white_light_dn + noise.floor_dn2) ** 0.5
