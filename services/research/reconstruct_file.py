@@ -98,7 +98,7 @@ class FileReconstruction(Reconstruction):
         report = self.report
         rows, cols = report.solved
         seconds = sum(report.seconds.values())
-        return f"{report.method}, bin {report.bin}, solved on {rows} x {cols}, {seconds:.3f} s"
+        return f"{report.method}, bin {report.bin}, solved on {rows} x {cols} by FFTW, {seconds:.3f} s"
 
     def save(self, path: str | Path) -> None:
         """Write the picture, marked if it is simulated.

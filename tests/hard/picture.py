@@ -19,7 +19,7 @@ SHADES = (  # upper limit of the loss, colour, text colour
 REFUSED = "#8a8f98", "#ffffff"
 LEGEND = (
     "PCC inside the lit field; in brackets its change against the same method's clean frame",
-    "m: a message is given   e: explained below the table   red frame: must not be",
+    "m: a message is given   e: explained in hard-cases.md   red frame: must not be",
 )
 
 

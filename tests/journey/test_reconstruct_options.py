@@ -40,7 +40,7 @@ def test_bin_rounds_and_settings_are_used_and_reported(folder: Path) -> None:
     report = folder / "r.json"
     answer = call(reconstruct(folder, "--bin", "2", "--rounds", "3", "--set", "tau=0.5", "--report", str(report)))
     assert answer.code == 0, answer.err
-    assert "open, bin 2, solved on 48 x 64, " in answer.out
+    assert "open, bin 2, solved on 48 x 64 by FFTW, " in answer.out
     facts = json.loads(report.read_text())
     assert (facts["bin"], facts["rounds"], facts["solved"]) == (2, 3, [48, 64])
     assert facts["regularisation"]["tau"] == 0.5

@@ -33,14 +33,19 @@ def attach_sensor(spec: InstrumentSpec, buses: EmulatedBuses) -> None:
     libcamera.plugged.append(Sensor(world, buses, model=str(camera.sensor), bits=camera.bit_depth))
 
 
+def real_drivers(spec: InstrumentSpec) -> str:
+    """Return the driver packages of the parts that are not simulated, with their versions."""
+    used = {"picamera2": spec.camera.backend, "spidev": spec.light.backend, "smbus2": spec.bus.backend}
+    return ", ".join(f"{name} {version(name)}" for name, backend in used.items() if backend != "sim")
+
+
 def main(words: list[str]) -> None:
     """Run a command of diffuscope whose head has real drivers."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--head", type=Path, required=True)
     spec = load_head(head_file(parser.parse_known_args(words)[0].head))
     buses = emulated_buses()
-    drivers = ", ".join(f"{name} {version(name)}" for name in ("picamera2", "spidev", "smbus2"))
-    write([f"Emulated buses: the drivers are real ({drivers}), the eye is simulated"])
+    write([f"Emulated buses: the drivers are real ({real_drivers(spec)}), the eye is simulated"])
     if spec.camera.backend == "picamera2":
         attach_sensor(spec, buses)
     printer = BusPrinter(buses.folder)
