@@ -44,6 +44,7 @@ from device.recon.estimation.refraction.estimator import (
 )
 from device.recon.estimation.refraction.notation import report_of, scatter_of
 from device.recon.estimation.refraction.task import RefractionTask
+from device.recon.estimation.spots import Spots, on_sensor
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.compiled import read_only
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -53,9 +54,16 @@ from device.recon.model.preprocessing import Linear, Preprocessor
 from device.recon.model.resampling import to_sensor
 from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, working_bin
 from device.recon.solvers.solver import Diagnostics, Solver
-from device.values import Calibration, Image, Reconstruction, RefractionOffset, Report, check_image_shape
+from device.values import Calibration, Image, Mask, Reconstruction, RefractionOffset, Report, check_image_shape
 
 Check = Future[Consistency | None]
+SPOT_SEARCHES = 4
+MAX_HIDDEN = 0.15  # share of the sensor: with more the frame is another one
+MAX_EXPLAINED = 1.2  # rms residual of a frame without its spots: 0.86 to 1.0
+DUST = (
+    "Dark spots, {share:.1%} of the frame, were left out; the largest is at row {row}, column {col} of the sensor. "
+    "Clean sensor and diffuser; if they stay, measure the flat frame again."
+)
 CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
 
 
@@ -478,7 +486,7 @@ class Reconstructor:
                 run = _Run(self, steady.counts, dark, run.deadline, rounds)
                 again = yield from self._solve(run, asked, _Known())
                 made = steadier(made, again, steady.flicker)
-        yield made
+        yield (yield from _without_spots(self, run, asked, made, solving_s))
 
     def _solve(self, run: "_Run", asked: "_Asked", known: "_Known") -> Generator[Step, None, Reconstruction]:
         """Yield the steps before the picture, and return the picture."""
@@ -718,6 +726,41 @@ def _reported_refraction(
     return corrected(eye, offset) if isinstance(eye, Refraction) else eye
 
 
+def _without_spots(
+    owner: Reconstructor, run: "_Run", asked: "_Asked", made: Reconstruction, solving_s: float
+) -> Generator[Step, None, Reconstruction]:
+    """Yield the steps of the frame without its spots; return its picture if the forward model explains it, else `made`.
+
+    The first residual shows the largest spots only, beside errors that they cause around them: each search is one of
+    the frame without the spots found before. Every search takes `solving_s`, and none begins after the deadline.
+    """
+    counts, joined, best = run.counts, asked.joined, made
+    hidden: Mask = np.zeros(owner.shape, np.bool_)
+    first = spots = run.spots
+    for _ in range(SPOT_SEARCHES):
+        if spots is None or not run.fits(solving_s):
+            break
+        hidden |= on_sensor(spots.samples, run.done.grid)
+        if hidden.mean() > MAX_HIDDEN:
+            break
+        asked = replace(asked, joined=None if joined is None else np.where(hidden, np.float32(np.nan), joined))
+        run = _Run(owner, np.where(hidden, np.float32(np.nan), counts), run.dark, run.deadline, run.most)
+        best = yield from owner._solve(run, asked, _Known())
+        spots = run.spots
+    before, after = made.report.residual, best.report.residual
+    if first is None or before is None or after is None or after >= min(before, MAX_EXPLAINED):
+        return made
+    if is_banded(best.report.quality):  # something else is wrong with this frame
+        return made
+    report = best.report
+    share = float(hidden.mean())
+    row, col = (at + n * run.done.grid.n for at, n in zip(run.done.grid.first_px, first.largest, strict=True))
+    notes = (DUST.format(share=share, row=row, col=col),) if first.are_dark else ()
+    known = {"flicker": made.report.quality["flicker"]} if "flicker" in made.report.quality else {}
+    quality = report.quality | known | {"spots": share}
+    return replace(best, report=replace(report, quality=quality, warnings=(*report.warnings, *notes)))
+
+
 def _flicker_of_rows(finder: FlickerFinder, run: "_Run") -> float:
     counts, dark, _ = run.brightest()
     steady = finder(counts, dark)
@@ -806,6 +849,11 @@ class _Run:
     def cost_s(self, stage: _Stage) -> float:
         """Return the minimum duration of a stage in seconds: start, one round and finish, for all channels."""
         return self.channels * stage.least_s - (self.channels - 1) * stage.finish_cost.seconds
+
+    @property
+    def spots(self) -> Spots | None:
+        """Parts of a frame of one channel that its picture does not explain."""
+        return None if self.solved is None or self.channels > 1 else self.solved.diagnostics.spots
 
     def brightest(self) -> ChannelFrame:
         """Return counts, dark frame and defective pixels of the channel with the highest mean count."""

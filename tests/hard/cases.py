@@ -38,6 +38,9 @@ BANDS = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"),
     "A closed form has no residual that would tell bands of the lamp from lines of the object: it only reports them.",
 )
+SPOTS = dict.fromkeys(
+    ("tikhonov", "gradient", "evidence"), "A closed form has no residual, in which light that is no image would stand."
+)
 NO_TEST = dict.fromkeys(("tikhonov", "gradient"), "This closed form has no test of the PSF; the default has one.")
 PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
 HALF_LIGHT = {"all": "Half the electrons for the same counts: the shot noise is larger by the root of 2."}
@@ -234,6 +237,13 @@ CASES: tuple[Case, ...] = (
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
+    _case(
+        "reflex, not clipped",
+        "light",
+        lambda eye: eye.clean.with_raw(defects.reflex(eye.clean.raw, eye.spec.camera)),
+        "misfit",
+        SPOTS,
+    ),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),

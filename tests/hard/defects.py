@@ -97,6 +97,13 @@ def bands(counts: Counts, camera: CameraSpec, share: float, phase: float = 0.3) 
     return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
 
 
+def reflex(counts: Counts, camera: CameraSpec) -> Counts:
+    """Add a disc of 60 % of the mean light that is not clipped: a reflex that did not pass the diffuser."""
+    rows, cols = (np.arange(n) - at * n for n, at in zip(counts.shape, GLARE_AT, strict=True))
+    disc = rows[:, None] ** 2 + cols**2 < (0.055 * counts.shape[0]) ** 2
+    return _as_counts(counts + 0.6 * (counts.mean() - camera.black_dn) * disc, camera)
+
+
 def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
     """Raise all counts by `more_dn`, so that the black level differs from the head file; round and clip."""
     return _as_counts(counts + more_dn, camera)

@@ -34,6 +34,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("eye", ("no eye", "from everywhere")),
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),
+    ("spots", ("dark spots",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
     ("counts", ("black level", "gain", "bits", "counts")),

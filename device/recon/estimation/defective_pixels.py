@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon.estimation.shading import Shading
+from device.recon.estimation.spots import on_sensor
 from device.recon.model import kernels
 from device.recon.model.compiled import read_only
 from device.recon.model.fft_plans import Planner
@@ -351,7 +352,7 @@ class HaloFinder:
                 break
             reach = grown
             good = np.where((reach[owner] > 0) & (ring <= reach[owner] + HALO_MARGIN), np.float32(0), frame.good)
-        return self._on_sensor(good < frame.good, defective.shape)
+        return on_sensor(good < frame.good, self._model.grid)
 
     def _excess(self, frame: Linear) -> tuple[Image, float]:
         """Return the light beyond the blurred smooth field as a share of it, 0 where it is dim, and its robust sd."""
@@ -362,15 +363,6 @@ class HaloFinder:
         usable = lit & (frame.good > 0.5)
         noise = float(np.median(np.abs(excess[usable]))) / 0.6745 if usable.any() else float("inf")
         return np.asarray(excess, np.float32), noise
-
-    def _on_sensor(self, samples: Mask, shape: tuple[int, int]) -> Mask:
-        """Return the sensor pixels of these samples of the window as a mask."""
-        grid = self._model.grid
-        pixels = np.zeros(shape, np.bool_)
-        block = np.repeat(np.repeat(samples, grid.n, 0), grid.n, 1)
-        top, left = grid.first_px
-        pixels[top : top + block.shape[0], left : left + block.shape[1]] = block
-        return pixels
 
 
 def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64], own: Mask) -> int:

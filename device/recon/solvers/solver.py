@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from device.recon.estimation.spots import Spots
 from device.recon.model.preprocessing import Linear
 from device.values import Image
 
@@ -28,12 +29,15 @@ class Diagnostics:
         Parameters, most of them chosen from the frame.
     quality
         Figures of frame and picture.
+    spots
+        Parts of the frame that no object explains; None: none, or not searched for.
     """
 
     noise_dn: float | None = None
     residual: float | None = None
     regularisation: Figures = field(default_factory=dict)
     quality: Figures = field(default_factory=dict)
+    spots: Spots | None = None
 
 
 class Solver(Protocol):

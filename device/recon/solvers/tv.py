@@ -20,6 +20,7 @@ from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.estimation.power_law_prior import Fit, PowerLaw, PowerLawPrior
 from device.recon.estimation.shading import Shading
+from device.recon.estimation.spots import find_spots
 from device.recon.method_settings import Settings
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, RealFft
@@ -32,6 +33,7 @@ KAPPA = 1.8  # of tau: within 0.03 dB of the optimum over 1 to 120 ke-, bins 2 a
 RHO = 5.0  # stiffness of z and w, in units of tau per level
 STIFF = 1.0  # stiffness of v, in units of a typical weight
 TAPER_PX = 60
+MAX_NOISE = 1.0  # rms residual of noise alone: 0.85 to 0.98
 FILLS = 2  # of a frame with gaps; see `_fill_gaps`
 
 
@@ -124,6 +126,7 @@ class EvidenceWiener:
         self.diagnostics = replace(
             known,
             residual=known.residual if added.residual is None else added.residual,
+            spots=known.spots if added.spots is None else added.spots,
             regularisation={**known.regularisation, **added.regularisation},
             quality={**known.quality, **added.quality},
         )
@@ -310,7 +313,7 @@ class TotalVariation(EvidenceWiener):
         """Write the picture to `out` (grid, float32), and its misfit to `diagnostics`.
 
         `residual` is the rms residual in units of the noise. With a known field the quality figures also
-        have `coverage` and the flicker figure `banding`.
+        have `coverage` and the flicker figure `banding`, and `spots` are searched for if more than noise is left.
         """
         super().finish(out)
         noise = self.detail.noise
@@ -322,3 +325,8 @@ class TotalVariation(EvidenceWiener):
             light_dn = self.detail.mean_dn
             banding = quality_figures.banding(left, noise.variance_dn2(light_dn), light_dn)
             self._add_diagnostics(Diagnostics(quality={"banding": banding}))
+            if residual > MAX_NOISE:
+                variance_dn2 = noise.per_dn * np.maximum(self.blurred[grid.slices], 0) + noise.floor_dn2
+                left /= np.sqrt(np.maximum(variance_dn2, 1e-9))
+                spots = find_spots(left, self._good > 0)
+                self._add_diagnostics(Diagnostics(spots=spots))
