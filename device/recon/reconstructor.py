@@ -664,7 +664,7 @@ class Reconstructor:
         dark = not run.solved.has_light
         quality = run.solved.quality
         if run.done.is_closed_form and len(self.stages) == 1:  # no residual, which would show bands: the row means do
-            quality["banding"] = _flicker_of_rows(self.flicker, run)
+            quality |= _flicker_of_rows(self.flicker, run)
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
         psf_scale = self._psf_scale(run.eye)
         match = psf_match(quality)
@@ -761,10 +761,10 @@ def _without_spots(
     return replace(best, report=replace(report, quality=quality, warnings=(*report.warnings, *notes)))
 
 
-def _flicker_of_rows(finder: FlickerFinder, run: "_Run") -> float:
+def _flicker_of_rows(finder: FlickerFinder, run: "_Run") -> dict[str, float]:
     counts, dark, _ = run.brightest()
     steady = finder(counts, dark)
-    return 0.0 if steady is None else steady.flicker
+    return {} if steady is None else {"banding": steady.flicker}
 
 
 def steadier(made: Reconstruction, again: Reconstruction, flicker: float) -> Reconstruction:

@@ -86,7 +86,7 @@ QUALITY: Mapping[str, str] = {
     "spots": "Share of the frame that no object explains (dust, reflexes) and that was left out; absent without any.",
     "banding": (
         "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered. Of a closed "
-        "form: rms of the periodic gain of the rows."
+        "form: rms of the periodic gain of the rows, absent without flicker."
     ),
     "psf_score": "How far the spectrum of the frame follows that of the PSF: 1 exactly, 0 for another diffuser's.",
     "psf_score_sd": "Standard deviation of `psf_score`.",
