@@ -209,16 +209,26 @@ class BurstReconstructor:
         quality = made.report.quality
         cost_s = self._cost_s(frames, (), unusable) + sum(made.report.seconds.values())
         if (is_banded(quality) or "flicker" in quality) and run.fits(cost_s):
-            found = [self.single.flicker(frame, dark) for frame in frames]
-            flickers = [frame.flicker for frame in found if frame is not None]
-            if flickers:
-                steady = [own if new is None else new.counts for own, new in zip(frames, found, strict=True)]
+            steady, flicker = self._without_flicker(frames, dark, unusable or {})
+            if flicker is not None:
                 looks = {0: self.single.quick_look(steady[0], dark)}
-                again = yield from self._solve(
-                    _Run(self, run.deadline, eye_psf), steady, dark, unusable, {}, looks, simulated
-                )
-                made = steadier(made, again, max(flickers))
+                run = _Run(self, run.deadline, eye_psf)
+                again = yield from self._solve(run, steady, dark, unusable, {}, looks, simulated)
+                made = steadier(made, again, flicker)
         yield made
+
+    def _without_flicker(
+        self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str]
+    ) -> tuple[list[Pixels], float | None]:
+        """Return the frames without their flicker, as far as they show any, and the largest one; None without any."""
+        steady, flickers = list(frames), []
+        for k, frame in enumerate(frames):
+            usable = k not in unusable and frame.shape == self.single.shape
+            found = self.single.flicker(frame, dark) if usable else None
+            if found is not None:
+                steady[k] = found.counts
+                flickers.append(found.flicker)
+        return steady, max(flickers, default=None)
 
     def _solve(
         self,

@@ -480,13 +480,13 @@ class Reconstructor:
         begin_s = self.clock.now_s()
         made = yield from self._solve(run, asked, _Known(refraction, others, look))
         solving_s = self.clock.now_s() - begin_s - run.between_s
-        has_residual = made.report.residual is not None  # a closed form cannot tell whether another frame fits better
-        if joined is None and has_residual and is_banded(made.report.quality) and run.fits(solving_s):
+        can_tell = joined is None and not run.done.is_closed_form  # whether another frame is explained better
+        if can_tell and is_banded(made.report.quality) and run.fits(solving_s):
             steady = self.flicker(counts, dark)
             if steady is not None:
-                run = _Run(self, steady.counts, dark, run.deadline, rounds)
-                again = yield from self._solve(run, asked, _Known())
-                made = steadier(made, again, steady.flicker)
+                other = _Run(self, steady.counts, dark, run.deadline, rounds)
+                better = steadier(made, (yield from self._solve(other, asked, _Known())), steady.flicker)
+                made, run = (made, run) if better is made else (better, other)
         yield (yield from _without_spots(self, run, asked, made, solving_s))
 
     def _solve(self, run: "_Run", asked: "_Asked", known: "_Known") -> Generator[Step, None, Reconstruction]:
@@ -735,26 +735,30 @@ def _without_spots(
     The first residual shows the largest spots only, beside errors that they cause around them: each search is one of
     the frame without the spots found before. Every search takes `solving_s`, and none begins after the deadline.
     """
-    counts, joined, best = run.counts, asked.joined, made
+    counts, joined, best, share = run.counts, asked.joined, made, 0.0
     hidden: Mask = np.zeros(owner.shape, np.bool_)
     first = spots = run.spots
     for _ in range(SPOT_SEARCHES):
         if spots is None or not run.fits(solving_s):
             break
-        hidden |= on_sensor(spots.samples, run.done.grid)
+        hidden = hidden | on_sensor(spots.samples, run.done.grid)
         if hidden.mean() > MAX_HIDDEN:
             break
         asked = replace(asked, joined=None if joined is None else np.where(hidden, np.float32(np.nan), joined))
         run = _Run(owner, np.where(hidden, np.float32(np.nan), counts), run.dark, run.deadline, run.most)
-        best = yield from owner._solve(run, asked, _Known())
+        try:
+            again = yield from owner._solve(run, asked, _Known())
+        except FrameError:  # too little of the frame is left: the picture that was made stays
+            break
         spots = run.spots
+        if again.report.residual is not None and again.report.residual < (best.report.residual or 0.0):
+            best, share = again, float(hidden.mean())
     before, after = made.report.residual, best.report.residual
     if first is None or before is None or after is None or after >= min(BETTER * before, MAX_EXPLAINED):
         return made
     if is_banded(best.report.quality):  # something else is wrong with this frame
         return made
     report = best.report
-    share = float(hidden.mean())
     row, col = (at + n * run.done.grid.n for at, n in zip(run.done.grid.first_px, first.largest, strict=True))
     notes = (DUST.format(share=share, row=row, col=col),) if first.are_dark else ()
     known = {"flicker": made.report.quality["flicker"]} if "flicker" in made.report.quality else {}

@@ -61,7 +61,9 @@ class FlickerFinder:
         offset = self._dark if dark is None else np.asarray(dark, np.float32)
         offset = offset if offset.ndim == counts.ndim else offset[..., None]
         others = tuple(range(1, counts.ndim))
-        gain = row_gain(counts.mean(others, dtype=np.float64) - offset.mean(others, dtype=np.float64))
+        seen = np.isfinite(counts)
+        light = np.where(seen, counts - offset, 0).sum(others, dtype=np.float64)
+        gain = row_gain(light / np.maximum(seen.sum(others), 1))
         if gain is None:
             return None
         steady = (counts - offset) / gain.astype(np.float32).reshape(-1, *(1 for _ in others)) + offset
