@@ -735,13 +735,16 @@ def _without_spots(
     The first residual shows the largest spots only, beside errors that they cause around them: each search is one of
     the frame without the spots found before. Every search takes `solving_s`, and none begins after the deadline.
     """
+    if run.spots is None:
+        return made
     counts, joined, best, share = run.counts, asked.joined, made, 0.0
+    grid = run.done.grid  # of the spots; a later solution may end after its quick look, on another grid
     hidden: Mask = np.zeros(owner.shape, np.bool_)
     first = spots = run.spots
     for _ in range(SPOT_SEARCHES):
         if spots is None or not run.fits(solving_s):
             break
-        hidden = hidden | on_sensor(spots.samples, run.done.grid)
+        hidden = hidden | on_sensor(spots.samples, grid)
         if hidden.mean() > MAX_HIDDEN:
             break
         asked = replace(asked, joined=None if joined is None else np.where(hidden, np.float32(np.nan), joined))
@@ -759,7 +762,7 @@ def _without_spots(
     if is_banded(best.report.quality):  # something else is wrong with this frame
         return made
     report = best.report
-    row, col = (at + n * run.done.grid.n for at, n in zip(run.done.grid.first_px, first.largest, strict=True))
+    row, col = (at + n * grid.n for at, n in zip(grid.first_px, first.largest, strict=True))
     notes = (DUST.format(share=share, row=row, col=col),) if first.are_dark else ()
     known = {"flicker": made.report.quality["flicker"]} if "flicker" in made.report.quality else {}
     quality = report.quality | known | {"spots": share}
