@@ -735,12 +735,12 @@ def _without_spots(
     The first residual shows the largest spots only, beside errors that they cause around them: each search is one of
     the frame without the spots found before. Every search takes `solving_s`, and none begins after the deadline.
     """
-    if run.spots is None:
+    first = spots = run.spots
+    if first is None:
         return made
     counts, joined, best, share = run.counts, asked.joined, made, 0.0
     grid = run.done.grid  # of the spots; a later solution may end after its quick look, on another grid
     hidden: Mask = np.zeros(owner.shape, np.bool_)
-    first = spots = run.spots
     for _ in range(SPOT_SEARCHES):
         if spots is None or not run.fits(solving_s):
             break
@@ -757,7 +757,7 @@ def _without_spots(
         if again.report.residual is not None and again.report.residual < (best.report.residual or 0.0):
             best, share = again, float(hidden.mean())
     before, after = made.report.residual, best.report.residual
-    if first is None or before is None or after is None or after >= min(BETTER * before, MAX_EXPLAINED):
+    if before is None or after is None or after >= min(BETTER * before, MAX_EXPLAINED):
         return made
     if is_banded(best.report.quality):  # something else is wrong with this frame
         return made
