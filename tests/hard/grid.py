@@ -4,8 +4,11 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from device.errors import SettingError
 from services.research.reconstruct_file import write_or_raise
@@ -20,6 +23,7 @@ EYES = (
     Eye("short-sighted eye, paper's sensor", "sim", {"sim.seed": 7, "sim.eye.m_dpt": 2.5}),
     Eye("long-sighted eye, IMX296", "imx296", {"sim.seed": 5, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}),
 )
+DRAWN_DPT = 4.0  # drawn eyes have a mean sphere between minus and plus that
 QUICK_MERGED, QUICK_COLUMNS = 4, (DEFAULT_SCHEDULE, "gradient")  # of one eye: within a minute on a laptop
 QUICK = (
     "1.0% saturated",
@@ -39,6 +43,16 @@ QUICK = (
     "black level off by 20 DN",
 )
 ProgressCallback = Callable[[str], None]
+
+
+def drawn_eyes(count: int) -> tuple[Eye, ...]:
+    """Return eyes with other vessels, diffusers and refractions than `EYES`, by turns before the paper's and IMX296."""
+    spheres = np.random.default_rng(44).uniform(-DRAWN_DPT, DRAWN_DPT, count)
+    heads = {"sim": {}, "imx296": {"sim.peak_e": 8000.0}}
+    return tuple(
+        Eye(f"eye {k + 1}, {m_dpt:+.1f} dpt, {head}", head, {"sim.seed": 101 + k, "sim.eye.m_dpt": float(m_dpt)} | more)
+        for k, (m_dpt, (head, more)) in enumerate(zip(spheres, cycle(heads.items())))
+    )
 
 
 @dataclass(frozen=True)
