@@ -32,11 +32,11 @@ class Exposed:
             changes |= {"sim.object.kind": "image", "sim.object.image": str(photo)}
         self.spec = coarse(with_changes(load_head(resources.HEADS / f"{head}.toml"), changes), 2)
         of = World(self.spec, VirtualClock())
-        calibration = simulated_calibration(of)
+        self.calibration = simulated_calibration(of)
         self.truth = of.truth(self.spec.light.colour).astype(np.float64)
         self.frames = lit_frames(of, frames)
-        self.inside = field_mask(of.shape, field_radius_px(calibration))
-        self.make = Reconstructor(calibration, of.shape, scenes.PLANNER, VirtualClock())
+        self.inside = field_mask(of.shape, field_radius_px(self.calibration))
+        self.make = Reconstructor(self.calibration, of.shape, scenes.PLANNER, VirtualClock())
 
     def banded(self, share: float, frame: int = 0) -> Counts:
         """Return a frame with bands of +- `share`, whose phase differs from frame to frame."""
