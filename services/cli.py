@@ -188,7 +188,8 @@ def reconstruct(
     head: Annotated[Path | None, typer.Option(callback=_head_file, help="Head file or name, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
     field_fixed: Annotated[
-        bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
+        bool,
+        typer.Option("--field-fixed", help="Take the illuminated disc as exact, whatever the frame shows."),
     ] = False,
     no_refraction: Annotated[
         bool, typer.Option("--no-refraction", help="Leave out the eye's refraction, which --head has estimated.")

@@ -35,6 +35,7 @@ from services.imaging.colour_rendering import render_colour
 from services.imaging.picture_files import DISPLAY, to_png
 from services.lru_cache import LruCache
 from services.research import sweep_plot
+from services.research.given_field import LitField, is_doubtful, smaller_field
 from services.research.reconstruct_inputs import (
     LoadedPsfs,
     LoadedRaw,
@@ -163,13 +164,14 @@ class FileReconstructor:
     """Reconstruction of the raw frames of one recording with the same options.
 
     PSFs are read once for each shape of raw, and a solver is planned once for each shape and set of levels; KEPT_PLANS
-    are kept. Not thread-safe. `planner` replaces the one that keeps its FFT plans in `options.plans`. SettingError for
-    invalid options.
+    are kept. Not thread-safe. `planner` replaces the one that keeps its FFT plans in `options.plans`. `timed` False: a
+    budget adds the quick look but no deadline. SettingError for invalid options.
     """
 
-    def __init__(self, options: ReconstructOptions, planner: Planner | None = None) -> None:
+    def __init__(self, options: ReconstructOptions, planner: Planner | None = None, *, timed: bool = True) -> None:
         refuse_invalid(options)
         self._options = options
+        self._timed = timed
         self._planner = planner or Planner(options.plans)
         self._psfs: dict[tuple[Shape, int, str | None], LoadedPsfs | None] = {}
         self._plans = LruCache[tuple[object, ...], _FrameSolvers](KEPT_PLANS)
@@ -183,7 +185,28 @@ class FileReconstructor:
         light = None if self._options.calibration is None else stated_light(source)
         loaded = replace(load_raw(source, self._options.bayer), light=light)
         psfs = self._psfs_for(loaded)
-        plan = self._last = self._plan(loaded, psfs)
+        plan = self._plan(loaded, psfs, self._options.field_deg)
+        made = self._solved(plan, loaded, dark)
+        field = plan.smaller_field(made.report, loaded)
+        budget_s = self._options.budget_s
+        has_time = budget_s is None or 2 * sum(made.report.seconds.values()) < budget_s
+        if field is not None and has_time:
+            plan = self._plan(loaded, psfs, field.diameter_deg)
+            made = self._solved(plan, loaded, dark)
+        self._last = plan
+        of_field = () if field is None else (field.note(has_time),)
+        of_psfs = () if psfs is None else psfs.notes
+        notes = (*of_field, *loaded.notes, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
+        warnings = made.report.warnings
+        swapped = () if psfs is None else swap_notes(loaded, psfs)
+        if swapped:  # the reason why the PSF does not match
+            warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())
+        report = replace(made.report, warnings=(*warnings, *swapped, *notes))
+        picture = made.picture if loaded.bayer is None else bayer.whole_size(made.picture, loaded.shape)
+        return replace(made, picture=picture, report=report)
+
+    def _solved(self, plan: "_FrameSolvers", loaded: LoadedRaw, dark: Source | None) -> FileReconstruction:
+        """Return picture and report of a raw by the solvers of a plan; FrameError for one that cannot be solved."""
         own = None if dark is None else companion(dark, "the dark frame", loaded)
         pixels, own = without_unknown(loaded.raw.pixels, own)
         try:
@@ -198,15 +221,7 @@ class FileReconstructor:
                 f"{loaded.name} holds no signal above the black level",
                 "Give a frame that was taken with light; look whether the dark frame belongs to it.",
             )
-        of_psfs = () if psfs is None else psfs.notes
-        notes = (*loaded.notes, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
-        warnings = made.report.warnings
-        swapped = () if psfs is None else swap_notes(loaded, psfs)
-        if swapped:  # the reason why the PSF does not match
-            warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())
-        report = replace(made.report, warnings=(*warnings, *swapped, *notes))
-        picture = made.picture if loaded.bayer is None else bayer.whole_size(made.picture, loaded.shape)
-        return replace(made, picture=picture, report=report)
+        return made
 
     def evened(self, picture: Image) -> Image:
         """Return the last picture with the `even` correction, if the options have it."""
@@ -234,17 +249,18 @@ class FileReconstructor:
             self._psfs[key] = None if archived else load_psfs(self._options, loaded)
         return self._psfs[key]
 
-    def _plan(self, loaded: LoadedRaw, psfs: LoadedPsfs | None) -> "_FrameSolvers":
-        """Return the plan for the shape and levels of a raw, and make it the last one to be dropped."""
+    def _plan(self, loaded: LoadedRaw, psfs: LoadedPsfs | None, field_deg: float | None) -> "_FrameSolvers":
+        """Return the plan for the shape and levels of a raw and its field, and make it the last one to be dropped."""
         raw = loaded.raw
         bad = raw.bad.tobytes() if raw.bad.any() else b""
         levels = (raw.white_dn, raw.shift, raw.stored_bits, loaded.black_dn, loaded.simulated, loaded.light, bad)
-        key = (loaded.shape, loaded.channels, loaded.bayer, *levels)
+        key = (loaded.shape, loaded.channels, loaded.bayer, field_deg, *levels)
 
         def plan() -> _FrameSolvers:
-            calibrations = load_calibrations(self._options, loaded, psfs)
+            calibrations = load_calibrations(replace(self._options, field_deg=field_deg), loaded, psfs)
             is_mosaic = loaded.bayer is not None
-            return _FrameSolvers(self._options, calibrations, loaded.solved_shape, self._planner, is_mosaic)
+            of_frame = loaded.solved_shape, self._planner, is_mosaic, self._timed
+            return _FrameSolvers(self._options, calibrations, *of_frame)
 
         return self._plans.get_or_make(key, plan)
 
@@ -259,8 +275,10 @@ class _FrameSolvers:
         shape: Shape,
         planner: Planner,
         is_mosaic: bool,
+        timed: bool,
     ) -> None:
         self.calibrations, self.is_mosaic = calibrations, is_mosaic
+        self._timed = timed
         self._options = options
         self.shape = shape
         self._planner = planner
@@ -284,7 +302,7 @@ class _FrameSolvers:
         solvers = self._solvers[index]
         frames = [pixels] if len(solvers) == 1 else [plane(pixels, c) for c in range(3)]
         deadline = None
-        if options.budget_s is not None:
+        if options.budget_s is not None and self._timed:
             deadline = Deadline.after(self._clock, options.budget_s).later(-selected_s)
         made = []
         for c, (solver, frame) in enumerate(zip(solvers, frames, strict=True)):
@@ -302,6 +320,15 @@ class _FrameSolvers:
         )
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
 
+    def smaller_field(self, report: Report, loaded: LoadedRaw) -> LitField | None:
+        """Return the lit disc of a solved raw where it is smaller than the field; SettingError where it is larger."""
+        if not is_doubtful(report, self._options):
+            return None
+        pixels = loaded.raw.pixels
+        c = _brightest(pixels) if pixels.ndim == 3 else 0
+        calibration = self.calibrations[min(c, len(self.calibrations) - 1)]
+        return smaller_field(self._options, calibration, plane(pixels, c), self._planner, report.psf_index)
+
     def _planned(self, index: int) -> tuple[Reconstructor, ...]:
         """Return a solver for each calibration; all at the finest bin that one of them needs."""
         options = self._options
@@ -309,8 +336,10 @@ class _FrameSolvers:
         if len(self.calibrations) > 1 and options.bin is None and not periodic:
             finest = min(default_schedule(calibration, self.shape, index)[1].bin for calibration in self.calibrations)
             options = replace(options, bin=finest)
+        quick = options.budget_s is not None
+        options = options if self._timed else replace(options, budget_s=None)
         return tuple(
-            plan_reconstructor(options, calibration, self.shape, self._planner, index)
+            plan_reconstructor(options, calibration, self.shape, self._planner, index, quick=quick)
             for calibration in self.calibrations
         )
 
@@ -347,8 +376,8 @@ def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tup
     residual = report.residual or 0.0
     if residual > MAX_RESIDUAL and not notes and not set(MISMATCHES.values()) & set(report.warnings):
         found.append(
-            f"The residual is {residual:.1f} times the noise, and about 1 where the PSF explains the frame: parts "
-            "of the picture may be false."
+            f"The residual is {residual:.1f} times the noise, and about 1 where the picture explains the frame: parts "
+            "of it may be false."
         )
     return tuple(found)
 

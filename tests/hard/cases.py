@@ -8,6 +8,7 @@ import numpy as np
 from device.values import Mask
 from tests.hard import defects
 from tests.hard.frames import Eye, HardFrame, above_dark, crescent_dark
+from tests.paper.bench import with_changes
 
 Build = Callable[[Eye], HardFrame]
 
@@ -151,6 +152,11 @@ def motion(way_deg: float) -> Build:
     return lambda eye: eye.frame({"sim.eye.drift_deg_per_s": way_deg / eye.spec.camera.exposure_s})
 
 
+def given_field(field_deg: float) -> Build:
+    """Return the builder of a frame whose head file states a lit disc of `field_deg` degrees."""
+    return lambda eye: replace(eye.clean, head=with_changes(eye.clean.head, {"optics.field_deg": field_deg}))
+
+
 def foreign_psf(eye: Eye) -> HardFrame:
     """Return a frame with the PSF of another diffuser of the same kind."""
     sim = eye.spec.sim
@@ -225,6 +231,8 @@ CASES: tuple[Case, ...] = (
     _case("PSF off by 2 dpt", "wrong PSF", psf_of_eye(2.0), "", OTHER_EYE),
     _case("PSF of another head", "wrong PSF", foreign_psf, "psf", NO_TEST),
     _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf", NO_TEST),
+    *(_case(f"field given as {deg:g} deg", "parts of the field", given_field(deg), "lit") for deg in (28, 31, 40)),
+    _case("dark border", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(0.0, 15.5)), "lit"),
     _case("rim cut", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(5.0, 16.7)), "lit", CUT),
     _case(
         "half a lid",
@@ -243,6 +251,16 @@ CASES: tuple[Case, ...] = (
         lambda eye: eye.clean.with_raw(defects.reflex(eye.clean.raw, eye.spec.camera)),
         "misfit",
         SPOTS,
+    ),
+    _case(
+        "dust", "light", lambda eye: eye.clean.with_raw(defects.dust(eye.clean.raw, eye.spec.camera)), "spots", SPOTS
+    ),
+    _case(
+        "stray gradient 30 %",
+        "light",
+        lambda eye: eye.clean.with_raw(defects.gradient(eye.clean.raw, eye.spec.camera, 0.3)),
+        "eye bright",
+        PEDESTAL,
     ),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),

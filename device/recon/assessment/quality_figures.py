@@ -16,6 +16,7 @@ RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; OPTICS.md 1.1
 MIN_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 MISMATCH_SD = 3.0  # standard errors
 MIN_LIT = 0.75  # share of the field
+MIN_EXPLAINED_LIT = 0.95  # below, the field may be smaller than it was given: discs of 0.97 of it have 0.94
 SQUARES = 64  # across the field, each of which is lit or dark
 NEAR_SQUARES = 5  # side of the surroundings of one: in little light a single square is noise
 MAX_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
