@@ -19,7 +19,7 @@ from device.config.bayer import BayerOption
 from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.psf_consistency import PsfConsistency
-from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, Audience
+from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, UNEXPLAINED, Audience
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
@@ -374,7 +374,8 @@ def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tup
             "is lit, give the head (--head), or use the method 'open'."
         )
     residual = report.residual or 0.0
-    if residual > MAX_RESIDUAL and not notes and not set(MISMATCHES.values()) & set(report.warnings):
+    is_stated = any(words in MISMATCHES.values() or words.startswith(UNEXPLAINED) for words in report.warnings)
+    if residual > MAX_RESIDUAL and not notes and not is_stated:
         found.append(
             f"The residual is {residual:.1f} times the noise, and about 1 where the picture explains the frame: parts "
             "of it may be false."

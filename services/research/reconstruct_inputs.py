@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from device.calibration.archive import Archive
 from device.calibration.import_psf import MAX_SATURATED_SHARE
@@ -38,6 +39,7 @@ from device.recon.model.preprocessing import MAX_BAD
 from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
 from services.imaging.picture_files import read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
+from services.research.psf_notes import STENCIL, psf_notes
 
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
 RawSource = Source | Raw  # or counts that are read
@@ -211,6 +213,8 @@ def load_psfs(options: ReconstructOptions, loaded: LoadedRaw, per_channel: bool 
         require_raw_shape(name, (raw.pixels.shape[0], raw.pixels.shape[1]), loaded.solved_shape)
     cleaned = [tuple(map(without_hot_pixels, clean_channels(raw, name))) for raw, name in counts]
     notes = _saturation_notes(counts, cleaned)
+    for (raw, _), psfs in zip(counts, cleaned, strict=True):
+        notes += psf_notes(raw, _averaged(psfs))
     colour = any(len(psfs) == 3 for psfs in cleaned)
     if colour and not (per_channel and loaded.channels == 3):
         names = ", ".join(name for (_, name), psfs in zip(counts, cleaned, strict=True) if len(psfs) == 3)
@@ -232,7 +236,8 @@ def swap_notes(loaded: LoadedRaw, psfs: LoadedPsfs) -> tuple[str, ...]:
     PSF (Young's inequality for convolutions); SWAPPED leaves a margin for a cropped frame.
     """
     pixels = loaded.raw.pixels if loaded.channels == 1 else loaded.raw.pixels.mean(axis=2)
-    if concentration(pixels) <= SWAPPED * concentration(psfs.stacks[0][0].pixels):
+    psf = psfs.stacks[0][0].pixels
+    if concentration(pixels) <= SWAPPED * max(concentration(psf), _concentration_in_noise(psf)):
         return ()
     return (
         f"{loaded.label} looks like a PSF and {psfs.stacks[0][0].name} like a raw frame: they seem to be swapped. "
@@ -245,11 +250,23 @@ def concentration(image: NDArray[Any]) -> float:
 
     n is 4, or 1 for an image with less than 64 rows or columns; the blocks average the noise.
     """
-    n = 4 if min(image.shape) >= 64 else 1
-    rows, cols = (size // n for size in image.shape)
-    blocks = image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64)
+    blocks, _ = _block_means(image)
     light = np.maximum(blocks - np.quantile(blocks, 0.01), 0)
     return float(np.sqrt((light**2).mean()) / max(light.mean(), 1e-30))
+
+
+def _concentration_in_noise(psf: NDArray[Any]) -> float:
+    """Return the `concentration` of a PSF without pedestal, of whose rms the noise is taken."""
+    blocks, pixels = _block_means(psf)
+    noise = float((ndimage.convolve(psf, STENCIL) ** 2).mean()) / pixels
+    return float(np.sqrt(max((blocks**2).mean() - noise, 0.0)) / max(blocks.mean(), 1e-30))
+
+
+def _block_means(image: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
+    """Return the means of the blocks of `concentration`, and the pixels of a block."""
+    n = 4 if min(image.shape) >= 64 else 1
+    rows, cols = (size // n for size in image.shape)
+    return image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64), n**2
 
 
 def _psf_frames(source: Source, name: str) -> list[tuple[Raw, str]]:

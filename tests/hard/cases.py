@@ -7,7 +7,7 @@ import numpy as np
 
 from device.values import Mask
 from tests.hard import defects
-from tests.hard.frames import Eye, HardFrame, above_dark, crescent_dark
+from tests.hard.frames import Eye, Floats, HardFrame, above_dark, crescent_dark
 from tests.paper.bench import with_changes
 
 Build = Callable[[Eye], HardFrame]
@@ -165,6 +165,21 @@ def foreign_psf(eye: Eye) -> HardFrame:
     return replace(eye.clean, psf=other.psf, sphere_dpt=None)
 
 
+def measured_psf(peak_e: float, changed: Callable[[Floats], Floats] = lambda psf_dn: psf_dn) -> Build:
+    """Return the builder of a frame with a PSF as the camera takes it.
+
+    Its brightest unmerged pixel has `peak_e` electrons; its counts without the black level are `changed`.
+    """
+
+    def build(eye: Eye) -> HardFrame:
+        camera = eye.spec.camera
+        psf_dn = defects.psf_counts(eye.clean.psf, camera, peak_e * eye.merged**2).astype(np.float64) - camera.black_dn
+        counts = np.clip(np.rint(changed(psf_dn) + camera.black_dn), 0, camera.white_dn)
+        return replace(eye.clean, psf=counts.astype(np.uint16))
+
+    return build
+
+
 def turned_psf(eye: Eye) -> HardFrame:
     """Return a frame with the head's PSF rotated by 180 degrees."""
     return replace(eye.clean, psf=np.ascontiguousarray(eye.clean.psf[::-1, ::-1]), sphere_dpt=None)
@@ -231,6 +246,16 @@ CASES: tuple[Case, ...] = (
     _case("PSF off by 2 dpt", "wrong PSF", psf_of_eye(2.0), "", OTHER_EYE),
     _case("PSF of another head", "wrong PSF", foreign_psf, "psf", NO_TEST),
     _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf", NO_TEST),
+    _case("PSF of 30 e-", "wrong PSF", measured_psf(30), "psf misfit"),
+    *(
+        _case(f"PSF with {name}", "wrong PSF", measured_psf(15000, changed), "psf misfit")
+        for name, changed in (
+            ("stray gradient 10 %", lambda psf_dn: psf_dn + 0.1 * psf_dn.max() * np.linspace(0, 1, psf_dn.shape[1])),
+            ("black level 100 DN too high", lambda psf_dn: np.maximum(psf_dn - 100, 0)),
+            ("black level 100 DN too low", lambda psf_dn: psf_dn + 100),
+            ("its peaks clipped at 10 %", lambda psf_dn: np.minimum(psf_dn, 0.1 * psf_dn.max())),
+        )
+    ),
     *(_case(f"field given as {deg:g} deg", "parts of the field", given_field(deg), "lit") for deg in (28, 31, 40)),
     _case("dark border", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(0.0, 15.5)), "lit"),
     _case("rim cut", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(5.0, 16.7)), "lit", CUT),

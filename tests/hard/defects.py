@@ -21,6 +21,13 @@ PWM_HZ = 400.0  # of dimmed LEDs
 FLICKER_HZ, READ_S = 100.0, 0.032  # mains light, and a rolling shutter's time from the first row to the last
 
 
+def psf_counts(psf: Image, camera: CameraSpec, peak_e: float) -> Counts:
+    """Return a PSF as the camera takes it, with `peak_e` electrons in its brightest pixel."""
+    rng = np.random.default_rng(47)
+    arrived_e = rng.poisson(np.maximum(psf, 0) / psf.max() * peak_e)
+    return _as_counts(rng.normal(arrived_e, camera.read_noise_e) / camera.gain_e_per_dn + camera.black_dn, camera)
+
+
 def dead_columns(shape: tuple[int, int]) -> Mask:
     """Return the mask of twelve columns of a full sensor, in four groups of three."""
     dead = np.zeros(shape, np.bool_)

@@ -32,6 +32,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("signal", ("no signal",)),
     ("dim", ("too little light",)),
     ("eye", ("no eye", "from everywhere")),
+    ("swapped", ("swapped",)),
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),
     ("spots", ("dark spots",)),
