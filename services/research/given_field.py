@@ -1,7 +1,6 @@
 """Field that was given for a raw frame, compared with the lit disc in the frame."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import FrameError, SettingError
@@ -55,7 +54,7 @@ def smaller_field(
     SettingError where the frame is lit outside of that field.
     """
     assert options.head is not None
-    spec = options.head if isinstance(options.head, InstrumentSpec) else load_head(Path(options.head))
+    spec = options.head if isinstance(options.head, InstrumentSpec) else load_head(options.head)
     given_deg, of_head_deg = calibration.field_deg, picture_field_deg(spec)
     if given_deg is None or of_head_deg is None or not has_sharp_edge(spec):
         return None

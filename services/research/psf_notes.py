@@ -18,34 +18,49 @@ STENCIL = (np.outer([1, -2, 1], [1, -2, 1]) / 6).astype(
 Floats = NDArray[np.float64]
 
 
-def psf_notes(raw: Raw, psf: Psf) -> tuple[str, ...]:
-    """Return sentences about a PSF image, of colour about its mean; `psf` is the same, cleaned."""
-    pixels = np.asarray(raw.pixels if raw.pixels.ndim == 2 else raw.pixels.mean(axis=2), np.float64)
+def background_notes(raw: Raw, name: str) -> tuple[str, ...]:
+    """Return a sentence about stray light that rises over a PSF image and is taken out; empty without any."""
+    pixels = _mean_channel(raw)
+    plane = background_plane(pixels, ~raw.bad)
+    if plane is None:
+        return ()
+    share = float(np.ptp(plane)) / float(pixels.max() - plane.min())
+    return (
+        f"{name}: stray light that rises by {share:.0%} of the highest value over the image was taken out. "
+        "Measure the PSF again in a dark room.",
+    )
+
+
+def damage_notes(raw: Raw, psf: Psf) -> tuple[str, ...]:
+    """Return sentences about a PSF image, of colour about its mean, that is cut off below, has few counts or is noisy.
+
+    `psf` is the same, cleaned.
+    """
+    pixels = _mean_channel(raw)
     found = []
-    good = ~raw.bad
-    plane = background_plane(pixels, good)
-    if plane is not None:
-        share = float(np.ptp(plane)) / float(pixels.max() - plane.min())
+    ratio = cut_ratio(pixels)
+    if ratio is not None:
         found.append(
-            f"{psf.name}: stray light that rises by {share:.0%} of the highest value over the image was taken out. "
-            "Measure the PSF again in a dark room."
-        )
-    elif (beside := cut_ratio(pixels)) is not None:
-        found.append(
-            f"{psf.name} is cut off below: beside pixels at the lowest value others have {beside:.1%} of the highest. "
+            f"{psf.name} is cut off below: beside pixels at the lowest value others have {ratio:.1%} of the highest. "
             "Subtract less from it, or measure it with a lower black level."
         )
-    if raw.pixels.dtype.kind == "u" and (steps := float(pixels.max() - np.median(pixels))) < MIN_STEPS:
+    steps = float(pixels.max() - np.median(pixels))
+    share = noise_ratio(psf.pixels, ~raw.bad)
+    if raw.pixels.dtype.kind == "u" and steps < MIN_STEPS:
         found.append(
             f"{psf.name} has few counts: {steps:.0f} above its background at the brightest pixel. "
             "Measure it again with a longer exposure or a brighter point."
         )
-    elif (share := noise_ratio(psf.pixels, good)) > MAX_NOISE_RATIO:
+    elif share > MAX_NOISE_RATIO:
         found.append(
             f"{psf.name} is noisy: {share:.0%} of its power is noise. "
             "Measure it again with more light, or give the mean of several images."
         )
     return tuple(found)
+
+
+def _mean_channel(raw: Raw) -> Floats:
+    return np.asarray(raw.pixels if raw.pixels.ndim == 2 else raw.pixels.mean(axis=2), np.float64)
 
 
 def cut_ratio(pixels: Floats) -> float | None:

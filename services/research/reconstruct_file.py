@@ -19,8 +19,10 @@ from device.config.bayer import BayerOption
 from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.psf_consistency import PsfConsistency
-from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, UNEXPLAINED, Audience
+from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, PSF_FIGURES, UNEXPLAINED, Audience
 from device.recon.estimation.psf_selection import most_likely_psf
+from device.recon.estimation.refraction.estimator import NoRefraction
+from device.recon.estimation.refraction.notation import report_of
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
 from device.recon.methods import METHODS, Method
@@ -45,6 +47,7 @@ from services.research.reconstruct_inputs import (
     Source,
     companion,
     companion_notes,
+    head_notes,
     load_calibrations,
     load_psfs,
     load_raw,
@@ -56,6 +59,7 @@ from services.research.reconstruct_inputs import (
 ENDINGS = (".npy", ".tif", ".tiff", ".png")
 MIN_SAMPLES = 16  # of the shorter side
 MAX_ROUNDS = 100_000
+MIN_GAMMA, MAX_GAMMA = 0.2, 5.0
 MAX_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
 ONCE = "FFTW_ESTIMATE"  # plans of one picture: to measure them takes longer than the picture. Measured ones are used
 KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up to about 300 MB at full sensor size
@@ -183,7 +187,7 @@ class FileReconstructor:
         `dark`: the dark frame of this raw alone, (rows, cols) of it.
         """
         light = None if self._options.calibration is None else stated_light(source)
-        loaded = replace(load_raw(source, self._options.bayer), light=light)
+        loaded = replace(load_raw(source, self._options.bayer, gamma=self._options.gamma), light=light)
         psfs = self._psfs_for(loaded)
         plan = self._plan(loaded, psfs, self._options.field_deg)
         made = self._solved(plan, loaded, dark)
@@ -195,12 +199,17 @@ class FileReconstructor:
             made = self._solved(plan, loaded, dark)
         self._last = plan
         of_field = () if field is None else (field.note(has_time),)
-        of_psfs = () if psfs is None else psfs.notes
-        notes = (*of_field, *loaded.notes, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
+        of_psfs = () if psfs is None else (*psfs.notes, *psfs.damage)
+        if psfs is not None and psfs.damage:
+            made = replace(made, report=without_psf_figures(made.report))
+        of_raw = (*loaded.notes, *head_notes(self._options, loaded))
+        notes = (*of_field, *of_raw, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
         warnings = made.report.warnings
         swapped = () if psfs is None else swap_notes(loaded, psfs)
-        if swapped:  # the reason why the PSF does not match
+        if swapped or loaded.notes:  # the reason why the PSF does not match
             warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())
+        if swapped or loaded.notes or of_psfs:
+            warnings = tuple(UNEXPLAINED if words.startswith(UNEXPLAINED) else words for words in warnings)
         report = replace(made.report, warnings=(*warnings, *swapped, *notes))
         picture = made.picture if loaded.bayer is None else bayer.whole_size(made.picture, loaded.shape)
         return replace(made, picture=picture, report=report)
@@ -357,6 +366,13 @@ class _FrameSolvers:
         return index
 
 
+def without_psf_figures(report: FileReport) -> FileReport:
+    """Return the report of a picture with a damaged PSF, without refraction and figures of the spectrum."""
+    refraction = None if report.refraction_dpt is None else report_of(NoRefraction("the PSF is damaged"))
+    quality = {name: None if name in PSF_FIGURES else figure for name, figure in report.quality.items()}
+    return replace(report, refraction_dpt=refraction, refraction_scatter=None, quality=quality)
+
+
 def file_report(report: Report, solver: Reconstructor, options: ReconstructOptions) -> FileReport:
     """Return the report of a solver with what was set and the size on which it solved the frame."""
     return FileReport(**vars(report), solved=_solved_size(solver, report), given=given_options(options))
@@ -429,6 +445,7 @@ def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[s
         "budget_s": options.budget_s,
         "field_deg": options.field_deg,
         "bayer": options.bayer,
+        "gamma": options.gamma,
         "refraction": None if options.refraction else "left out",
     }
     given: dict[str, float | str | dict[str, float]] = {
@@ -501,6 +518,11 @@ def _recipes(
 
 def refuse_invalid(options: ReconstructOptions) -> None:
     """Raise SettingError for options that are out of range or contradict each other, before any computation."""
+    if options.gamma is not None and not MIN_GAMMA <= options.gamma <= MAX_GAMMA:
+        raise SettingError(
+            f"a gamma of {options.gamma:g} is that of no picture",
+            f"Give --gamma between {MIN_GAMMA:g} and {MAX_GAMMA:g}, as a rule 2.2.",
+        )
     if (options.calibration is None) == (not options.psfs):
         raise SettingError("a picture needs either PSFs or a calibration", "Give --psf FILE or --calibration DIR[:ID].")
     refuse_invalid_settings(options)

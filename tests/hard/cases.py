@@ -297,6 +297,13 @@ CASES: tuple[Case, ...] = (
         lambda eye: eye.clean.with_raw(defects.eight_bits(eye.clean.raw, eye.spec.camera)),
         "counts",
     ),
+    *(
+        _case(name, "wrong counts", lambda eye, change=change: eye.clean.with_raw(change(eye)), "counts misfit lit eye")
+        for name, change in (
+            ("8 bit, gamma 2.2", lambda eye: defects.gamma(eye.clean.raw, eye.spec.camera)),
+            ("8 bit, JPEG", lambda eye: defects.jpeg(defects.eight_bits(eye.clean.raw, eye.spec.camera))),
+        )
+    ),
     *(_case(f"black level off by {dn} DN", "wrong counts", offset(dn), "counts") for dn in (1, 5, 20)),
     _case("gain off by 2", "wrong counts", gain(2.0), "counts"),
     _case("gain off by 0.5", "wrong counts", gain(0.5), "counts", HALF_LIGHT),

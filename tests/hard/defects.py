@@ -4,10 +4,12 @@ Counts are uint16 (rows, cols); `white_dn` is the full-scale count, `black_dn` t
 of the rows, positions shares of rows or columns, so that merged pixels have the same defect.
 """
 
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
 from device.config.head_file import CameraSpec
 from device.values import Counts, Image, Mask
@@ -134,6 +136,19 @@ def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
 def eight_bits(counts: Counts, camera: CameraSpec) -> NDArray[np.uint8]:
     """Return the upper eight bits of the counts of the head's converter."""
     return np.asarray(counts >> (camera.bit_depth - 8), np.uint8)
+
+
+def gamma(counts: Counts, camera: CameraSpec) -> NDArray[np.uint8]:
+    """Return the light above black as a picture of 8 bits has it, with a gamma of 2.2."""
+    light = np.clip((counts.astype(np.float64) - camera.black_dn) / (camera.white_dn - camera.black_dn), 0, 1)
+    return np.rint(255 * light ** (1 / 2.2)).astype(np.uint8)
+
+
+def jpeg(counts: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return counts of 8 bits after a compression as JPEG of quality 90."""
+    file = BytesIO()
+    Pillow.fromarray(counts).save(file, "JPEG", quality=90)
+    return np.asarray(Pillow.open(file))
 
 
 def missing(counts: Counts, share: float) -> Image:

@@ -38,7 +38,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("spots", ("dark spots",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
-    ("counts", ("black level", "gain", "bits", "counts")),
+    ("counts", ("black level", "gain", "bits", "counts", "jpeg")),
     ("pixels", ("pixel",)),
 )
 ALWAYS = frozenset({"refraction"})  # an uncertain refraction is no statement about the picture

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.config.image_files import as_psf, psf_counts
-from services.research.psf_notes import psf_notes
+from services.research.psf_notes import background_notes, damage_notes
 
 SHAPE = (120, 160)
 PEAK_DN = 3000.0
@@ -30,7 +30,8 @@ def measured(noise_dn: float = 2.0, peak_dn: float = PEAK_DN) -> NDArray[np.floa
 
 def notes_on(pixels: NDArray[Any]) -> tuple[str, ...]:
     counts = np.rint(pixels).clip(0).astype(np.uint16) if pixels.max() > 1 else pixels.astype(np.float32)
-    return psf_notes(psf_counts(counts, "psf"), as_psf(counts, "psf"))
+    raw = psf_counts(counts, "psf")
+    return (*background_notes(raw, "psf"), *damage_notes(raw, as_psf(counts, "psf")))
 
 
 RAMP = np.linspace(0, 1, SHAPE[1]) * np.ones((SHAPE[0], 1))
