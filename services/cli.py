@@ -180,6 +180,9 @@ def reconstruct(
     bayer: Annotated[
         str | None, typer.Option(metavar="RGGB", help="The raw is a mosaic: rggb, bggr, grbg or gbrg; or none.")
     ] = None,
+    gamma: Annotated[
+        float | None, typer.Option(help="Make raw, dark and flat frame linear: 2.2 for those of a picture.")
+    ] = None,
     dark: Annotated[
         list[str] | None,
         typer.Option(metavar="[NAME=]FILE", help="Dark frame of the same exposure; with NAME that of one channel."),
@@ -188,7 +191,8 @@ def reconstruct(
     head: Annotated[Path | None, typer.Option(callback=_head_file, help="Head file or name, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
     field_fixed: Annotated[
-        bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
+        bool,
+        typer.Option("--field-fixed", help="Take the illuminated disc as exact, whatever the frame shows."),
     ] = False,
     no_refraction: Annotated[
         bool, typer.Option("--no-refraction", help="Leave out the eye's refraction, which --head has estimated.")
@@ -233,6 +237,7 @@ def reconstruct(
         bayer=parse_bayer(bayer),
         field_fixed=field_fixed,
         refraction=not no_refraction,
+        gamma=gamma,
     )
     refuse_mixed(raws, channels, darks, each)
     with working("reconstructing") as beat:

@@ -16,6 +16,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -36,6 +37,9 @@ from device.values import Image, Mask, Psf
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy")  # of the images of a recording's folder
 MEASURE_PSF = "Give an image of one point of light in a dark room, neither saturated nor processed."
+BORDER_PARTS = 4  # of each side of a PSF image
+MIN_RISE = 0.005  # of its highest value, over the image: stray light that is taken out
+MAX_UNEVEN = 0.15  # of the rise: rms of the border that a plane may leave
 READABLE = (*SUFFIXES, ".npz", ".dng")
 Pixels = NDArray[Any]
 _DECODER_ERRORS = (  # exceptions of the decoders on truncated or damaged files
@@ -346,7 +350,8 @@ def as_psf(array: Pixels, name: str) -> Psf:
     """Return a measured PSF image as a Psf: justification undone, invalid pixels zeroed, pedestal subtracted, sum 1.
 
     A pedestal of mass beta makes every picture (1 + beta) times too bright away from its mean (NUMERICS.md 3.5, item
-    6). Therefore the median of the border pixels is subtracted. Negative values stay: clipping would add mass again.
+    6). Therefore the median of the border pixels is subtracted, and `background_plane`. Negative values stay: clipping
+    would add mass again.
     The channels of a colour PSF are averaged. PsfError for NaN, infinite values, negative integers, an image of one
     value (dark or saturated all over), or a sum <= 0.
     """
@@ -386,6 +391,40 @@ def saturated_share(psf: Psf, raw: Raw, white_dn: float | None = None) -> float:
     return float(psf.pixels[full].sum(dtype=np.float64)) if np.count_nonzero(full) > CHANCE_PIXELS else 0.0
 
 
+def background_plane(pixels: Pixels, good: Mask) -> NDArray[np.float64] | None:
+    """Return the plane of stray light that rises over a PSF image, (rows, cols) in its units; None without one.
+
+    It is the least-squares plane through the medians of parts of the border, if it explains them and rises by more than
+    MIN_RISE of the highest value.
+    """
+    size = np.array(pixels.shape)
+    edge = max(1, min(pixels.shape) // 50)
+    places, medians = [], []
+    for part in _border_parts(pixels.shape, edge):
+        if good[part].any():
+            middle = np.array([(span.start + span.stop - 1) / 2 for span in part])
+            places.append([1.0, *(middle / (size - 1) - 0.5)])
+            medians.append(float(np.median(pixels[part][good[part]])))
+    if len(medians) < 4 * BORDER_PARTS or min(pixels.shape) <= 8:
+        return None
+    plane = np.linalg.lstsq(np.array(places), np.array(medians), rcond=None)[0]
+    left = np.array(medians) - np.array(places) @ plane
+    rise = float(np.abs(plane[1:]).sum())
+    if rise < MIN_RISE * float(pixels.max() - np.median(medians)) or float(left.std()) > MAX_UNEVEN * rise:
+        return None
+    rows, cols = (np.linspace(-0.5, 0.5, count) for count in pixels.shape)
+    return np.asarray(plane[0] + plane[1] * rows[:, None] + plane[2] * cols, np.float64)
+
+
+def _border_parts(shape: tuple[int, ...], edge: int) -> list[tuple[slice, slice]]:
+    """Return BORDER_PARTS equal parts of each side of an image's border, `edge` pixels wide."""
+    rows, cols = (np.linspace(0, size, BORDER_PARTS + 1).astype(int) for size in shape)
+    across = [slice(*pair) for pair in pairwise(cols)]
+    down = [slice(*pair) for pair in pairwise(rows)]
+    ends = [(slice(0, edge), slice(size - edge, size)) for size in shape]
+    return [(end, part) for end in ends[0] for part in across] + [(part, end) for end in ends[1] for part in down]
+
+
 def _cleaned(raw: Raw, name: str) -> Psf:
     """Return the PSF of counts, averaged over the channels, without pedestal and invalid pixels; see `as_psf`."""
     top = raw.pixels.max()
@@ -396,6 +435,9 @@ def _cleaned(raw: Raw, name: str) -> Psf:
     if pixels.ndim == 3:
         pixels = pixels.mean(axis=2)
     good = ~raw.bad
+    plane = background_plane(pixels, good)
+    if plane is not None:
+        pixels = np.asarray(pixels - plane, np.float32)
     edge = max(1, min(pixels.shape) // 50)
     border = np.ones(pixels.shape, np.bool_)
     border[edge:-edge, edge:-edge] = False

@@ -171,12 +171,17 @@ class CaptureReconstructor:
 
     def load(self, frames: CaptureFrames) -> LoadedCapture:
         """Return the frames of a capture with planned solvers; FrameError if none can be used, or for colour raws."""
-        lit = tuple(load_raw(source, self._options.bayer, checked=False) for source in frames.lit)
+        lit = tuple(
+            load_raw(source, self._options.bayer, checked=False, gamma=self._options.gamma) for source in frames.lit
+        )
         unusable = {**unusable_raws(lit), **frames.unusable}
         if len(unusable) == len(lit):
             raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take it again.")
         common = common_raw([frame for k, frame in enumerate(lit) if k not in unusable])
-        others = {name: tuple(load_raw(source) for source in sources) for name, sources in frames.colours.items()}
+        others = {
+            name: tuple(load_raw(source, gamma=self._options.gamma) for source in sources)
+            for name, sources in frames.colours.items()
+        }
         _refuse_different(common, others)
         plan, notes, selected_s = self._plan(
             common, {name: common_raw(given) for name, given in others.items()}, frames
@@ -244,7 +249,7 @@ class CaptureReconstructor:
         """Return the calibration of the options for a raw, and notes about the files of the PSFs."""
         psfs = None if options.calibration is not None else load_psfs(options, common, per_channel=False)
         (calibration,) = load_calibrations(options, common, psfs)
-        return calibration, () if psfs is None else psfs.notes
+        return calibration, () if psfs is None else (*psfs.notes, *psfs.damage)
 
     def _reported(self, made: Reconstruction, loaded: LoadedCapture) -> CaptureReconstruction:
         """Return the result with the report of a file; FrameError for a picture without signal."""

@@ -19,8 +19,10 @@ from device.config.bayer import BayerOption
 from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.psf_consistency import PsfConsistency
-from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, Audience
+from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, PSF_FIGURES, UNEXPLAINED, Audience
 from device.recon.estimation.psf_selection import most_likely_psf
+from device.recon.estimation.refraction.estimator import NoRefraction
+from device.recon.estimation.refraction.notation import report_of
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
 from device.recon.methods import METHODS, Method
@@ -35,6 +37,7 @@ from services.imaging.colour_rendering import render_colour
 from services.imaging.picture_files import DISPLAY, to_png
 from services.lru_cache import LruCache
 from services.research import sweep_plot
+from services.research.given_field import LitField, is_doubtful, smaller_field
 from services.research.reconstruct_inputs import (
     LoadedPsfs,
     LoadedRaw,
@@ -44,6 +47,7 @@ from services.research.reconstruct_inputs import (
     Source,
     companion,
     companion_notes,
+    head_notes,
     load_calibrations,
     load_psfs,
     load_raw,
@@ -55,6 +59,7 @@ from services.research.reconstruct_inputs import (
 ENDINGS = (".npy", ".tif", ".tiff", ".png")
 MIN_SAMPLES = 16  # of the shorter side
 MAX_ROUNDS = 100_000
+MIN_GAMMA, MAX_GAMMA = 0.2, 5.0
 MAX_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
 ONCE = "FFTW_ESTIMATE"  # plans of one picture: to measure them takes longer than the picture. Measured ones are used
 KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up to about 300 MB at full sensor size
@@ -163,13 +168,14 @@ class FileReconstructor:
     """Reconstruction of the raw frames of one recording with the same options.
 
     PSFs are read once for each shape of raw, and a solver is planned once for each shape and set of levels; KEPT_PLANS
-    are kept. Not thread-safe. `planner` replaces the one that keeps its FFT plans in `options.plans`. SettingError for
-    invalid options.
+    are kept. Not thread-safe. `planner` replaces the one that keeps its FFT plans in `options.plans`. `timed` False: a
+    budget adds the quick look but no deadline. SettingError for invalid options.
     """
 
-    def __init__(self, options: ReconstructOptions, planner: Planner | None = None) -> None:
+    def __init__(self, options: ReconstructOptions, planner: Planner | None = None, *, timed: bool = True) -> None:
         refuse_invalid(options)
         self._options = options
+        self._timed = timed
         self._planner = planner or Planner(options.plans)
         self._psfs: dict[tuple[Shape, int, str | None], LoadedPsfs | None] = {}
         self._plans = LruCache[tuple[object, ...], _FrameSolvers](KEPT_PLANS)
@@ -181,9 +187,35 @@ class FileReconstructor:
         `dark`: the dark frame of this raw alone, (rows, cols) of it.
         """
         light = None if self._options.calibration is None else stated_light(source)
-        loaded = replace(load_raw(source, self._options.bayer), light=light)
+        loaded = replace(load_raw(source, self._options.bayer, gamma=self._options.gamma), light=light)
         psfs = self._psfs_for(loaded)
-        plan = self._last = self._plan(loaded, psfs)
+        plan = self._plan(loaded, psfs, self._options.field_deg)
+        made = self._solved(plan, loaded, dark)
+        field = plan.smaller_field(made.report, loaded)
+        budget_s = self._options.budget_s
+        has_time = budget_s is None or 2 * sum(made.report.seconds.values()) < budget_s
+        if field is not None and has_time:
+            plan = self._plan(loaded, psfs, field.diameter_deg)
+            made = self._solved(plan, loaded, dark)
+        self._last = plan
+        of_field = () if field is None else (field.note(has_time),)
+        of_psfs = () if psfs is None else (*psfs.notes, *psfs.damage)
+        if psfs is not None and psfs.damage:
+            made = replace(made, report=without_psf_figures(made.report))
+        of_raw = (*loaded.notes, *head_notes(self._options, loaded))
+        notes = (*of_field, *of_raw, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
+        warnings = made.report.warnings
+        swapped = () if psfs is None else swap_notes(loaded, psfs)
+        if swapped or loaded.notes:  # the reason why the PSF does not match
+            warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())
+        if swapped or loaded.notes or of_psfs:
+            warnings = tuple(UNEXPLAINED if words.startswith(UNEXPLAINED) else words for words in warnings)
+        report = replace(made.report, warnings=(*warnings, *swapped, *notes))
+        picture = made.picture if loaded.bayer is None else bayer.whole_size(made.picture, loaded.shape)
+        return replace(made, picture=picture, report=report)
+
+    def _solved(self, plan: "_FrameSolvers", loaded: LoadedRaw, dark: Source | None) -> FileReconstruction:
+        """Return picture and report of a raw by the solvers of a plan; FrameError for one that cannot be solved."""
         own = None if dark is None else companion(dark, "the dark frame", loaded)
         pixels, own = without_unknown(loaded.raw.pixels, own)
         try:
@@ -198,15 +230,7 @@ class FileReconstructor:
                 f"{loaded.name} holds no signal above the black level",
                 "Give a frame that was taken with light; look whether the dark frame belongs to it.",
             )
-        of_psfs = () if psfs is None else psfs.notes
-        notes = (*loaded.notes, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
-        warnings = made.report.warnings
-        swapped = () if psfs is None else swap_notes(loaded, psfs)
-        if swapped:  # the reason why the PSF does not match
-            warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())
-        report = replace(made.report, warnings=(*warnings, *swapped, *notes))
-        picture = made.picture if loaded.bayer is None else bayer.whole_size(made.picture, loaded.shape)
-        return replace(made, picture=picture, report=report)
+        return made
 
     def evened(self, picture: Image) -> Image:
         """Return the last picture with the `even` correction, if the options have it."""
@@ -234,17 +258,18 @@ class FileReconstructor:
             self._psfs[key] = None if archived else load_psfs(self._options, loaded)
         return self._psfs[key]
 
-    def _plan(self, loaded: LoadedRaw, psfs: LoadedPsfs | None) -> "_FrameSolvers":
-        """Return the plan for the shape and levels of a raw, and make it the last one to be dropped."""
+    def _plan(self, loaded: LoadedRaw, psfs: LoadedPsfs | None, field_deg: float | None) -> "_FrameSolvers":
+        """Return the plan for the shape and levels of a raw and its field, and make it the last one to be dropped."""
         raw = loaded.raw
         bad = raw.bad.tobytes() if raw.bad.any() else b""
         levels = (raw.white_dn, raw.shift, raw.stored_bits, loaded.black_dn, loaded.simulated, loaded.light, bad)
-        key = (loaded.shape, loaded.channels, loaded.bayer, *levels)
+        key = (loaded.shape, loaded.channels, loaded.bayer, field_deg, *levels)
 
         def plan() -> _FrameSolvers:
-            calibrations = load_calibrations(self._options, loaded, psfs)
+            calibrations = load_calibrations(replace(self._options, field_deg=field_deg), loaded, psfs)
             is_mosaic = loaded.bayer is not None
-            return _FrameSolvers(self._options, calibrations, loaded.solved_shape, self._planner, is_mosaic)
+            of_frame = loaded.solved_shape, self._planner, is_mosaic, self._timed
+            return _FrameSolvers(self._options, calibrations, *of_frame)
 
         return self._plans.get_or_make(key, plan)
 
@@ -259,8 +284,10 @@ class _FrameSolvers:
         shape: Shape,
         planner: Planner,
         is_mosaic: bool,
+        timed: bool,
     ) -> None:
         self.calibrations, self.is_mosaic = calibrations, is_mosaic
+        self._timed = timed
         self._options = options
         self.shape = shape
         self._planner = planner
@@ -284,7 +311,7 @@ class _FrameSolvers:
         solvers = self._solvers[index]
         frames = [pixels] if len(solvers) == 1 else [plane(pixels, c) for c in range(3)]
         deadline = None
-        if options.budget_s is not None:
+        if options.budget_s is not None and self._timed:
             deadline = Deadline.after(self._clock, options.budget_s).later(-selected_s)
         made = []
         for c, (solver, frame) in enumerate(zip(solvers, frames, strict=True)):
@@ -302,6 +329,15 @@ class _FrameSolvers:
         )
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
 
+    def smaller_field(self, report: Report, loaded: LoadedRaw) -> LitField | None:
+        """Return the lit disc of a solved raw where it is smaller than the field; SettingError where it is larger."""
+        if not is_doubtful(report, self._options):
+            return None
+        pixels = loaded.raw.pixels
+        c = _brightest(pixels) if pixels.ndim == 3 else 0
+        calibration = self.calibrations[min(c, len(self.calibrations) - 1)]
+        return smaller_field(self._options, calibration, plane(pixels, c), self._planner, report.psf_index)
+
     def _planned(self, index: int) -> tuple[Reconstructor, ...]:
         """Return a solver for each calibration; all at the finest bin that one of them needs."""
         options = self._options
@@ -309,8 +345,10 @@ class _FrameSolvers:
         if len(self.calibrations) > 1 and options.bin is None and not periodic:
             finest = min(default_schedule(calibration, self.shape, index)[1].bin for calibration in self.calibrations)
             options = replace(options, bin=finest)
+        quick = options.budget_s is not None
+        options = options if self._timed else replace(options, budget_s=None)
         return tuple(
-            plan_reconstructor(options, calibration, self.shape, self._planner, index)
+            plan_reconstructor(options, calibration, self.shape, self._planner, index, quick=quick)
             for calibration in self.calibrations
         )
 
@@ -326,6 +364,13 @@ class _FrameSolvers:
         if self._options.sweep is not None:
             _draw_sweep(self._options.sweep, loaded.name, calibration, scores)
         return index
+
+
+def without_psf_figures(report: FileReport) -> FileReport:
+    """Return the report of a picture with a damaged PSF, without refraction and figures of the spectrum."""
+    refraction = None if report.refraction_dpt is None else report_of(NoRefraction("the PSF is damaged"))
+    quality = {name: None if name in PSF_FIGURES else figure for name, figure in report.quality.items()}
+    return replace(report, refraction_dpt=refraction, refraction_scatter=None, quality=quality)
 
 
 def file_report(report: Report, solver: Reconstructor, options: ReconstructOptions) -> FileReport:
@@ -345,10 +390,11 @@ def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tup
             "is lit, give the head (--head), or use the method 'open'."
         )
     residual = report.residual or 0.0
-    if residual > MAX_RESIDUAL and not notes and not set(MISMATCHES.values()) & set(report.warnings):
+    is_stated = any(words in MISMATCHES.values() or words.startswith(UNEXPLAINED) for words in report.warnings)
+    if residual > MAX_RESIDUAL and not notes and not is_stated:
         found.append(
-            f"The residual is {residual:.1f} times the noise, and about 1 where the PSF explains the frame: parts "
-            "of the picture may be false."
+            f"The residual is {residual:.1f} times the noise, and about 1 where the picture explains the frame: parts "
+            "of it may be false."
         )
     return tuple(found)
 
@@ -399,6 +445,7 @@ def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[s
         "budget_s": options.budget_s,
         "field_deg": options.field_deg,
         "bayer": options.bayer,
+        "gamma": options.gamma,
         "refraction": None if options.refraction else "left out",
     }
     given: dict[str, float | str | dict[str, float]] = {
@@ -471,6 +518,11 @@ def _recipes(
 
 def refuse_invalid(options: ReconstructOptions) -> None:
     """Raise SettingError for options that are out of range or contradict each other, before any computation."""
+    if options.gamma is not None and not MIN_GAMMA <= options.gamma <= MAX_GAMMA:
+        raise SettingError(
+            f"a gamma of {options.gamma:g} is that of no picture",
+            f"Give --gamma between {MIN_GAMMA:g} and {MAX_GAMMA:g}, as a rule 2.2.",
+        )
     if (options.calibration is None) == (not options.psfs):
         raise SettingError("a picture needs either PSFs or a calibration", "Give --psf FILE or --calibration DIR[:ID].")
     refuse_invalid_settings(options)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from device.calibration.archive import Archive
 from device.calibration.import_psf import MAX_SATURATED_SHARE
@@ -38,6 +39,8 @@ from device.recon.model.preprocessing import MAX_BAD
 from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
 from services.imaging.picture_files import read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
+from services.research.psf_notes import STENCIL, background_notes, damage_notes
+from services.research.raw_notes import bits_note, raw_notes
 
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
 RawSource = Source | Raw  # or counts that are read
@@ -54,7 +57,8 @@ class ReconstructOptions:
     file of the sweep plot. `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and
     `settings` (of the method, see device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`:
     the raw is a mosaic of this pattern, or "none". `field_fixed`: the field is known exactly, and the refraction does
-    not estimate its edge. `refraction` False leaves the refraction out.
+    not estimate its edge. `refraction` False leaves the refraction out. `gamma`: exponent that makes the counts of raw,
+    dark and flat frame linear in the light.
     """
 
     psfs: tuple[Source, ...] = ()
@@ -74,6 +78,7 @@ class ReconstructOptions:
     bayer: BayerOption | None = None
     field_fixed: bool = False
     refraction: bool = True
+    gamma: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ class LoadedRaw:
 
     `shape` is (rows, cols) of the file, `bayer` the pattern of a mosaic, `black_dn` the black level that the file
     states, `light` the colour for which the PSFs of an archived calibration are chosen (None: all are used). `notes`
-    are sentences for the user.
+    are sentences for the user. `gamma` is the exponent by which its counts were made linear.
     """
 
     raw: Raw
@@ -93,6 +98,7 @@ class LoadedRaw:
     simulated: bool = False
     notes: tuple[str, ...] = ()
     light: Colour | None = None
+    gamma: float | None = None
 
     @property
     def label(self) -> str:
@@ -113,10 +119,15 @@ class LoadedRaw:
 
 @dataclass(frozen=True)
 class LoadedPsfs:
-    """The PSFs of a frame: one stack for all channels, or one for each of three; all stacks have the same length."""
+    """The PSFs of a frame: one stack for all channels, or one for each of three; all stacks have the same length.
+
+    `damage` are sentences about PSFs with which neither the refraction nor figures of the spectrum can be measured,
+    `notes` other sentences.
+    """
 
     stacks: tuple[tuple[Psf, ...], ...]
     notes: tuple[str, ...]
+    damage: tuple[str, ...] = ()
 
 
 def name_of(source: RawSource, name: str) -> str:
@@ -147,10 +158,13 @@ def stated_light(raw: RawSource) -> Colour | None:
     return None if stated is None or stated.illumination is None else stated.illumination.colour
 
 
-def load_raw(source: RawSource, pattern: BayerOption | None = None, checked: bool = True) -> LoadedRaw:
+def load_raw(
+    source: RawSource, pattern: BayerOption | None = None, checked: bool = True, gamma: float | None = None
+) -> LoadedRaw:
     """Return the raw frame of a file or array; FrameError for one that cannot be read or, if `checked`, be solved.
 
-    `pattern` None: the pattern that a DNG states, if its pixels are those of a mosaic; else no mosaic.
+    `pattern` None: the pattern that a DNG states, if its pixels are those of a mosaic; else no mosaic. `gamma`: the
+    exponent that makes its counts linear in the light.
     """
     name = name_of(source, "the raw")
     file = _read(source, name)
@@ -158,12 +172,24 @@ def load_raw(source: RawSource, pattern: BayerOption | None = None, checked: boo
     raw, black_dn = with_levels(read, file.levels)
     if checked:
         refuse_without_signal(raw, name)
+    encoded = raw_notes(raw, Path(name).name, is_linear=gamma is not None)
+    if gamma is not None:
+        raw = replace(raw, pixels=linear(raw.pixels, _full_dn(raw), gamma))
     rows, cols = raw.pixels.shape[:2]
     pattern, notes = bayer.pattern_of(raw.pixels, pattern, file.levels.bayer, black_dn or 0.0, Path(name).name)
     if pattern is not None:
         planes = bayer.split(raw.pixels, pattern, raw.white_dn)
         raw = replace(raw, pixels=planes, bad=bayer.any_site(raw.bad))
-    return LoadedRaw(raw, name, (rows, cols), pattern, black_dn, is_simulated(source), notes)
+    return LoadedRaw(raw, name, (rows, cols), pattern, black_dn, is_simulated(source), (*encoded, *notes), gamma=gamma)
+
+
+def linear(counts: NDArray[Any], full_dn: float, gamma: float) -> Image:
+    """Return counts y as full_dn (y / full_dn)^gamma, float32 of the same shape: linear in the light, the same end."""
+    return np.asarray(full_dn * (np.maximum(counts, 0) / full_dn) ** gamma, np.float32)
+
+
+def _full_dn(raw: Raw) -> float:
+    return raw.white_dn if np.isfinite(raw.white_dn) else float(raw.pixels.max())
 
 
 def _read(source: RawSource, name: str) -> ImageFile:
@@ -210,7 +236,11 @@ def load_psfs(options: ReconstructOptions, loaded: LoadedRaw, per_channel: bool 
     for raw, name in counts:
         require_raw_shape(name, (raw.pixels.shape[0], raw.pixels.shape[1]), loaded.solved_shape)
     cleaned = [tuple(map(without_hot_pixels, clean_channels(raw, name))) for raw, name in counts]
-    notes = _saturation_notes(counts, cleaned)
+    damage = _saturation_notes(counts, cleaned)
+    notes: tuple[str, ...] = ()
+    for (raw, name), psfs in zip(counts, cleaned, strict=True):
+        notes += background_notes(raw, name)
+        damage += damage_notes(raw, _averaged(psfs))
     colour = any(len(psfs) == 3 for psfs in cleaned)
     if colour and not (per_channel and loaded.channels == 3):
         names = ", ".join(name for (_, name), psfs in zip(counts, cleaned, strict=True) if len(psfs) == 3)
@@ -219,10 +249,10 @@ def load_psfs(options: ReconstructOptions, loaded: LoadedRaw, per_channel: bool 
             "Give a PSF of one channel if only that one fits.",
         )
         averaged = tuple(_averaged(psfs) for psfs in cleaned)
-        return LoadedPsfs((averaged,), notes)
+        return LoadedPsfs((averaged,), notes, damage)
     if not colour:
-        return LoadedPsfs((tuple(psf for psfs in cleaned for psf in psfs),), notes)
-    return LoadedPsfs(tuple(tuple(psfs[c % len(psfs)] for psfs in cleaned) for c in range(3)), notes)
+        return LoadedPsfs((tuple(psf for psfs in cleaned for psf in psfs),), notes, damage)
+    return LoadedPsfs(tuple(tuple(psfs[c % len(psfs)] for psfs in cleaned) for c in range(3)), notes, damage)
 
 
 def swap_notes(loaded: LoadedRaw, psfs: LoadedPsfs) -> tuple[str, ...]:
@@ -232,7 +262,8 @@ def swap_notes(loaded: LoadedRaw, psfs: LoadedPsfs) -> tuple[str, ...]:
     PSF (Young's inequality for convolutions); SWAPPED leaves a margin for a cropped frame.
     """
     pixels = loaded.raw.pixels if loaded.channels == 1 else loaded.raw.pixels.mean(axis=2)
-    if concentration(pixels) <= SWAPPED * concentration(psfs.stacks[0][0].pixels):
+    psf = psfs.stacks[0][0].pixels
+    if concentration(pixels) <= SWAPPED * max(concentration(psf), _concentration_in_noise(psf)):
         return ()
     return (
         f"{loaded.label} looks like a PSF and {psfs.stacks[0][0].name} like a raw frame: they seem to be swapped. "
@@ -245,11 +276,23 @@ def concentration(image: NDArray[Any]) -> float:
 
     n is 4, or 1 for an image with less than 64 rows or columns; the blocks average the noise.
     """
-    n = 4 if min(image.shape) >= 64 else 1
-    rows, cols = (size // n for size in image.shape)
-    blocks = image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64)
+    blocks, _ = _block_means(image)
     light = np.maximum(blocks - np.quantile(blocks, 0.01), 0)
     return float(np.sqrt((light**2).mean()) / max(light.mean(), 1e-30))
+
+
+def _concentration_in_noise(psf: NDArray[Any]) -> float:
+    """Return the `concentration` of a PSF without pedestal, of whose rms the noise is taken."""
+    blocks, pixels = _block_means(psf)
+    noise = float((ndimage.convolve(psf, STENCIL) ** 2).mean()) / pixels
+    return float(np.sqrt(max((blocks**2).mean() - noise, 0.0)) / max(blocks.mean(), 1e-30))
+
+
+def _block_means(image: NDArray[Any]) -> tuple[NDArray[np.float64], int]:
+    """Return the means of the blocks of `concentration`, and the pixels of a block."""
+    n = 4 if min(image.shape) >= 64 else 1
+    rows, cols = (size // n for size in image.shape)
+    return image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64), n**2
 
 
 def _psf_frames(source: Source, name: str) -> list[tuple[Raw, str]]:
@@ -440,6 +483,8 @@ def companion(source: Source, what: str, loaded: LoadedRaw, above_black: bool = 
     if above_black:
         pixels = pixels - np.float32(file.levels.black_dn or 0)
     pixels = pixels / np.float32(2**loaded.raw.shift)
+    if loaded.gamma is not None:
+        pixels = linear(pixels, _full_dn(loaded.raw), loaded.gamma)
     pixels = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
     if pixels.shape != loaded.shape:
         raise FrameError(
@@ -464,6 +509,14 @@ def companion_notes(options: ReconstructOptions, calibration: Calibration) -> tu
         for name, source, image in given
         if source is not None and image is not None and np.count_nonzero(np.isnan(image)) > CHANCE_PIXELS
     )
+
+
+def head_notes(options: ReconstructOptions, loaded: LoadedRaw) -> tuple[str, ...]:
+    """Return a note on a raw that has fewer bits than the converter of its head."""
+    if options.head is None or loaded.gamma is not None:
+        return ()
+    spec = load_head(options.head) if isinstance(options.head, Path) else options.head
+    return bits_note(loaded.raw, loaded.label, spec.camera.bit_depth)
 
 
 def without_unknown(pixels: Pixels, dark: Image | None) -> tuple[Pixels, Image | None]:

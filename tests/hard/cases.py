@@ -7,7 +7,8 @@ import numpy as np
 
 from device.values import Mask
 from tests.hard import defects
-from tests.hard.frames import Eye, HardFrame, above_dark, crescent_dark
+from tests.hard.frames import Eye, Floats, HardFrame, above_dark, crescent_dark
+from tests.paper.bench import with_changes
 
 Build = Callable[[Eye], HardFrame]
 
@@ -151,12 +152,32 @@ def motion(way_deg: float) -> Build:
     return lambda eye: eye.frame({"sim.eye.drift_deg_per_s": way_deg / eye.spec.camera.exposure_s})
 
 
+def given_field(field_deg: float) -> Build:
+    """Return the builder of a frame whose head file states a lit disc of `field_deg` degrees."""
+    return lambda eye: replace(eye.clean, head=with_changes(eye.clean.head, {"optics.field_deg": field_deg}))
+
+
 def foreign_psf(eye: Eye) -> HardFrame:
     """Return a frame with the PSF of another diffuser of the same kind."""
     sim = eye.spec.sim
     assert sim is not None
     other = replace(eye, changes=dict(eye.changes) | {"sim.seed": sim.seed + 100}).clean
     return replace(eye.clean, psf=other.psf, sphere_dpt=None)
+
+
+def measured_psf(peak_e: float, changed: Callable[[Floats], Floats] = lambda psf_dn: psf_dn) -> Build:
+    """Return the builder of a frame with a PSF as the camera takes it.
+
+    Its brightest unmerged pixel has `peak_e` electrons; its counts without the black level are `changed`.
+    """
+
+    def build(eye: Eye) -> HardFrame:
+        camera = eye.spec.camera
+        psf_dn = defects.psf_counts(eye.clean.psf, camera, peak_e * eye.merged**2).astype(np.float64) - camera.black_dn
+        counts = np.clip(np.rint(changed(psf_dn) + camera.black_dn), 0, camera.white_dn)
+        return replace(eye.clean, psf=counts.astype(np.uint16))
+
+    return build
 
 
 def turned_psf(eye: Eye) -> HardFrame:
@@ -225,6 +246,18 @@ CASES: tuple[Case, ...] = (
     _case("PSF off by 2 dpt", "wrong PSF", psf_of_eye(2.0), "", OTHER_EYE),
     _case("PSF of another head", "wrong PSF", foreign_psf, "psf", NO_TEST),
     _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf", NO_TEST),
+    _case("PSF of 30 e-", "wrong PSF", measured_psf(30), "psf misfit"),
+    *(
+        _case(f"PSF with {name}", "wrong PSF", measured_psf(15000, changed), "psf misfit")
+        for name, changed in (
+            ("stray gradient 10 %", lambda psf_dn: psf_dn + 0.1 * psf_dn.max() * np.linspace(0, 1, psf_dn.shape[1])),
+            ("black level 100 DN too high", lambda psf_dn: np.maximum(psf_dn - 100, 0)),
+            ("black level 100 DN too low", lambda psf_dn: psf_dn + 100),
+            ("its peaks clipped at 10 %", lambda psf_dn: np.minimum(psf_dn, 0.1 * psf_dn.max())),
+        )
+    ),
+    *(_case(f"field given as {deg:g} deg", "parts of the field", given_field(deg), "lit") for deg in (28, 31, 40)),
+    _case("dark border", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(0.0, 15.5)), "lit"),
     _case("rim cut", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(5.0, 16.7)), "lit", CUT),
     _case(
         "half a lid",
@@ -244,6 +277,16 @@ CASES: tuple[Case, ...] = (
         "misfit",
         SPOTS,
     ),
+    _case(
+        "dust", "light", lambda eye: eye.clean.with_raw(defects.dust(eye.clean.raw, eye.spec.camera)), "spots", SPOTS
+    ),
+    _case(
+        "stray gradient 30 %",
+        "light",
+        lambda eye: eye.clean.with_raw(defects.gradient(eye.clean.raw, eye.spec.camera, 0.3)),
+        "eye bright",
+        PEDESTAL,
+    ),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),
@@ -253,6 +296,13 @@ CASES: tuple[Case, ...] = (
         "wrong counts",
         lambda eye: eye.clean.with_raw(defects.eight_bits(eye.clean.raw, eye.spec.camera)),
         "counts",
+    ),
+    *(
+        _case(name, "wrong counts", lambda eye, change=change: eye.clean.with_raw(change(eye)), "counts misfit lit eye")
+        for name, change in (
+            ("8 bit, gamma 2.2", lambda eye: defects.gamma(eye.clean.raw, eye.spec.camera)),
+            ("8 bit, JPEG", lambda eye: defects.jpeg(defects.eight_bits(eye.clean.raw, eye.spec.camera))),
+        )
     ),
     *(_case(f"black level off by {dn} DN", "wrong counts", offset(dn), "counts") for dn in (1, 5, 20)),
     _case("gain off by 2", "wrong counts", gain(2.0), "counts"),

@@ -1,12 +1,12 @@
 """Columns of the grid: each hard frame, reconstructed with every method and with the default schedule.
 
 A frame is written as the files that a user provides (raw, PSF, head file, flat frame) and read by the functions of
-`diffuscope reconstruct`. Planned reconstructors are cached by the content of all files except the raw; the command
-plans on every call.
+`diffuscope reconstruct`. Reconstructors are cached by the content of all files except the raw; the command plans on
+every call.
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,9 @@ from device.errors import DiffuscopeError
 from device.recon.assessment.metrics import pcc
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Reconstructor
 from device.values import Image, Mask, Reconstruction
-from services.research.reconstruct_file import plan_reconstructor
-from services.research.reconstruct_inputs import LoadedRaw, ReconstructOptions, load_calibration, load_raw
+from services.research.reconstruct_file import FileReconstructor
+from services.research.reconstruct_inputs import ReconstructOptions
 from tests.hard.cases import CLEAN, Case
 from tests.hard.frames import Eye, HardFrame, head_toml
 
@@ -26,7 +25,7 @@ DEFAULT_SCHEDULE = "ladder"  # the default schedule: quick look, refraction, ite
 COLUMNS = (DEFAULT_SCHEDULE, *METHODS)
 LONG_DEADLINE_S = 600.0  # of the command: it stops no solver, so the grid has none
 CRASHES = (ArithmeticError, ValueError, LookupError, TypeError)  # program errors, reported as `Cell.crashed`
-CACHE_SIZE = 8  # cached reconstructors; each takes up to about 300 MB at full sensor size
+CACHE_SIZE = 8  # cached reconstructors; each plan of one takes up to about 300 MB at full sensor size
 
 
 @dataclass(frozen=True)
@@ -62,33 +61,25 @@ class Cell:
 
 
 class SolverCache:
-    """Least-recently-used cache of planned reconstructors, keyed by the files for which they were planned."""
+    """Least-recently-used cache of file reconstructors with their plans, keyed by the files for which they planned."""
 
     def __init__(self) -> None:
         self._planner = Planner(folder=None, effort="FFTW_ESTIMATE")
-        self._kept: OrderedDict[tuple[object, ...], Reconstructor] = OrderedDict()
+        self._kept: OrderedDict[tuple[object, ...], FileReconstructor] = OrderedDict()
 
     def __call__(self, file: Path, order: ReconstructOptions, files: tuple[object, ...]) -> Reconstruction:
         """Return the result of `diffuscope reconstruct` on a raw with the options `order`.
 
-        `files` identifies the content of all files but the raw.
+        `files` identifies the content of all files but the raw. The durations of the steps, measured three times on
+        noise for a deadline, would not be used.
         """
-        loaded = load_raw(file, checked=False)
-        raw = loaded.raw
-        known = raw.stored_bits, raw.white_dn, raw.bad.tobytes() if raw.bad.any() else b""
-        key = (*files, order.method, order.budget_s, *known)
+        key = (*files, order.method, order.budget_s)
         if key not in self._kept:
-            self._kept[key] = self._planned(order, loaded)
+            self._kept[key] = FileReconstructor(order, self._planner, timed=False)
         self._kept.move_to_end(key)
         while len(self._kept) > CACHE_SIZE:
             self._kept.popitem(last=False)
-        return self._kept[key](raw.pixels, simulated=True)
-
-    def _planned(self, order: ReconstructOptions, loaded: LoadedRaw) -> Reconstructor:
-        """Plan without a deadline: the durations of the steps, measured three times on noise, would not be used."""
-        shape, untimed = loaded.solved_shape, replace(order, budget_s=None)
-        quick = order.budget_s is not None
-        return plan_reconstructor(untimed, load_calibration(order, loaded), shape, self._planner, 0, quick=quick)
+        return self._kept[key](file)
 
 
 class CaseRunner:

@@ -4,10 +4,12 @@ Counts are uint16 (rows, cols); `white_dn` is the full-scale count, `black_dn` t
 of the rows, positions shares of rows or columns, so that merged pixels have the same defect.
 """
 
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
 from device.config.head_file import CameraSpec
 from device.values import Counts, Image, Mask
@@ -19,6 +21,13 @@ BLOB_AT, BLOB_SHARE = (0.45, 0.56), 0.055  # 60 of 1080 rows
 GLARE_AT, GLARE_SIGMA = (0.42, 0.57), 0.022
 PWM_HZ = 400.0  # of dimmed LEDs
 FLICKER_HZ, READ_S = 100.0, 0.032  # mains light, and a rolling shutter's time from the first row to the last
+
+
+def psf_counts(psf: Image, camera: CameraSpec, peak_e: float) -> Counts:
+    """Return a PSF as the camera takes it, with `peak_e` electrons in its brightest pixel."""
+    rng = np.random.default_rng(47)
+    arrived_e = rng.poisson(np.maximum(psf, 0) / psf.max() * peak_e)
+    return _as_counts(rng.normal(arrived_e, camera.read_noise_e) / camera.gain_e_per_dn + camera.black_dn, camera)
 
 
 def dead_columns(shape: tuple[int, int]) -> Mask:
@@ -104,6 +113,21 @@ def reflex(counts: Counts, camera: CameraSpec) -> Counts:
     return _as_counts(counts + 0.6 * (counts.mean() - camera.black_dn) * disc, camera)
 
 
+def dust(counts: Counts, camera: CameraSpec) -> Counts:
+    """Take 35 % of the light from 14 discs of 2 % of the rows around the centre: dust on the sensor."""
+    rows, cols = counts.shape
+    places = np.random.default_rng(5).uniform(-0.3, 0.3, (14, 2)) * rows + np.array([rows, cols]) / 2
+    down, right = np.ogrid[:rows, :cols]
+    hidden = np.logical_or.reduce([np.hypot(down - at[0], right - at[1]) < 0.02 * rows for at in places])
+    return _as_counts(counts - 0.35 * hidden * (counts.astype(np.float64) - camera.black_dn), camera)
+
+
+def gradient(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Add stray light from 0 at the left to `share` of the mean light at the right edge."""
+    ramp = np.linspace(0, share, counts.shape[1]) * (counts.mean() - camera.black_dn)
+    return _as_counts(counts + ramp, camera)
+
+
 def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
     """Raise all counts by `more_dn`, so that the black level differs from the head file; round and clip."""
     return _as_counts(counts + more_dn, camera)
@@ -112,6 +136,19 @@ def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
 def eight_bits(counts: Counts, camera: CameraSpec) -> NDArray[np.uint8]:
     """Return the upper eight bits of the counts of the head's converter."""
     return np.asarray(counts >> (camera.bit_depth - 8), np.uint8)
+
+
+def gamma(counts: Counts, camera: CameraSpec) -> NDArray[np.uint8]:
+    """Return the light above black as a picture of 8 bits has it, with a gamma of 2.2."""
+    light = np.clip((counts.astype(np.float64) - camera.black_dn) / (camera.white_dn - camera.black_dn), 0, 1)
+    return np.rint(255 * light ** (1 / 2.2)).astype(np.uint8)
+
+
+def jpeg(counts: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return counts of 8 bits after a compression as JPEG of quality 90."""
+    file = BytesIO()
+    Pillow.fromarray(counts).save(file, "JPEG", quality=90)
+    return np.asarray(Pillow.open(file))
 
 
 def missing(counts: Counts, share: float) -> Image:

@@ -32,12 +32,13 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("signal", ("no signal",)),
     ("dim", ("too little light",)),
     ("eye", ("no eye", "from everywhere")),
+    ("swapped", ("swapped",)),
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),
     ("spots", ("dark spots",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
-    ("counts", ("black level", "gain", "bits", "counts")),
+    ("counts", ("black level", "gain", "bits", "counts", "jpeg")),
     ("pixels", ("pixel",)),
 )
 ALWAYS = frozenset({"refraction"})  # an uncertain refraction is no statement about the picture

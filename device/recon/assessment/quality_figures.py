@@ -16,6 +16,7 @@ RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; OPTICS.md 1.1
 MIN_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 MISMATCH_SD = 3.0  # standard errors
 MIN_LIT = 0.75  # share of the field
+MIN_EXPLAINED_LIT = 0.95  # below, the field may be smaller than it was given: discs of 0.97 of it have 0.94
 SQUARES = 64  # across the field, each of which is lit or dark
 NEAR_SQUARES = 5  # side of the surroundings of one: in little light a single square is noise
 MAX_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
@@ -31,6 +32,7 @@ PSF_FIGURES = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_
 SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
 FAINT_DN = 1e-9
 NO_SIGNAL = "There is no signal in this frame."
+UNEXPLAINED = "The picture does not explain this frame: parts of it may be false."
 # The words of these messages and of `quality_warnings` are sorted by KINDS in tests/hard/judgement.py.
 MISMATCHES = {
     Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
@@ -223,9 +225,7 @@ def _words_for_operators(quality: dict[str, float | None]) -> dict[str, str]:
     return {
         "saturated": f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.",
         "diffuse": "No eye was seen: the light came from everywhere. Centre the ring on the pupil.",
-        "unexplained": (
-            "The picture does not explain this frame: parts of it may be false. Take it again in steady light."
-        ),
+        "unexplained": f"{UNEXPLAINED} Take it again in steady light.",
         "partly lit": (
             f"Only {quality.get('coverage') or 0:.0%} of the field is lit. Ask to look at the green light; "
             "take it again."
@@ -238,10 +238,7 @@ def _words_for_files(quality: dict[str, float | None]) -> dict[str, str]:
     return {
         "saturated": f"{quality['saturated']:.1%} of the pixels are too bright: they are saturated and were left out.",
         "diffuse": "The light of this frame came from everywhere: most of it did not pass the diffuser as in the PSF.",
-        "unexplained": (
-            "The picture does not explain this frame: parts of it may be false. "
-            "Flicker and stray light are possible causes."
-        ),
+        "unexplained": f"{UNEXPLAINED} Flicker and stray light are possible causes.",
         "partly lit": f"Only {quality.get('coverage') or 0:.0%} of the field is lit: the rest of the picture is dark.",
         "too dark": "This frame holds too little light for vessels: what looks like one may be noise.",
     }

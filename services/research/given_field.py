@@ -1,0 +1,74 @@
+"""Field that was given for a raw frame, compared with the lit disc in the frame."""
+
+from dataclasses import dataclass
+
+from device.config.head_file import InstrumentSpec, load_head
+from device.errors import FrameError, SettingError
+from device.optics.lit_angle import has_sharp_edge, picture_field_deg
+from device.recon.assessment.lit_disc import lit_disc_deg
+from device.recon.assessment.quality_figures import MIN_EXPLAINED_LIT
+from device.recon.model.fft_plans import Planner
+from device.recon.model.kernels import Pixels
+from device.recon.reconstructor import MAX_EXPLAINED
+from device.values import Calibration, Report
+from services.research.reconstruct_inputs import ReconstructOptions
+
+TOLERANCE = 0.04  # of the given field: the disc is found within 0.012 of its diameter
+NEAR_HEAD = 0.03  # of the field of the head, which is then the one to give
+MARGIN = 1.01  # of a disc that was found: the picture must not end within it
+
+
+@dataclass(frozen=True)
+class LitField:
+    """Lit disc in degrees, which is smaller than the field that was given."""
+
+    diameter_deg: float
+    given_deg: float
+
+    def note(self, is_used: bool) -> str:
+        """Return the sentence of a report about it; `is_used`: the picture was made with the lit disc."""
+        found = f"Only a disc of {self.diameter_deg:g} degrees is lit, and the field was given as {self.given_deg:g}"
+        if not is_used:
+            return f"{found}. Give --field-deg {self.diameter_deg:g}; there was no time to solve the frame again."
+        return (
+            f"{found}: the picture was made with the lit disc, as by --field-deg {self.diameter_deg:g}. "
+            f"With --field-fixed it keeps {self.given_deg:g} degrees."
+        )
+
+
+def is_doubtful(report: Report, options: ReconstructOptions) -> bool:
+    """Return whether the field of a picture is to be compared with its frame: it was given, or the frame is odd."""
+    if options.field_fixed or options.head is None:
+        return False
+    lit = report.quality.get("coverage")
+    refused = report.refraction_dpt is not None and report.refraction_dpt.get("refused") is not None
+    is_odd = refused or (report.residual or 0.0) > MAX_EXPLAINED or (lit is not None and lit < MIN_EXPLAINED_LIT)
+    return options.field_deg is not None or is_odd
+
+
+def smaller_field(
+    options: ReconstructOptions, calibration: Calibration, counts: Pixels, planner: Planner, index: int
+) -> LitField | None:
+    """Return the lit disc of a frame (rows, cols) where it is smaller than the field that was given, else None.
+
+    SettingError where the frame is lit outside of that field.
+    """
+    assert options.head is not None
+    spec = options.head if isinstance(options.head, InstrumentSpec) else load_head(options.head)
+    given_deg, of_head_deg = calibration.field_deg, picture_field_deg(spec)
+    if given_deg is None or of_head_deg is None or not has_sharp_edge(spec):
+        return None
+    try:
+        found_deg = lit_disc_deg(calibration, counts, planner, index)
+    except FrameError:  # too little of it is left
+        return None
+    if found_deg is None or abs(found_deg / given_deg - 1) <= TOLERANCE:
+        return None
+    is_of_head = abs(found_deg / of_head_deg - 1) <= NEAR_HEAD
+    fitting_deg = of_head_deg if is_of_head else round(MARGIN * found_deg, 1)
+    if found_deg > given_deg:
+        raise SettingError(
+            f"the frame is lit in a disc of {fitting_deg:g} degrees, and its field was given as {given_deg:g}",
+            f"Give --field-deg {fitting_deg:g}. With --field-fixed the picture keeps {given_deg:g} degrees.",
+        )
+    return LitField(fitting_deg, given_deg)
