@@ -164,7 +164,7 @@ class BurstJoiner:
         `look`: its quick look, if there is one and quick looks are registered. FrameError without light or with too
         many missing pixels.
         """
-        counts = plane(frame, 0)
+        counts = self._single.lines(plane(frame, 0), dark).counts
         if look is None or not self.registers_quick_looks:
             look = self._single.quick_look(counts, dark)
         require_light(look)

@@ -13,6 +13,7 @@ from math import log
 import numpy as np
 
 from device.clock import Deadline
+from device.errors import FrameError
 from device.recon.assessment.quality_figures import is_banded
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame, require_light
 from device.recon.estimation.refraction.task import RefractionTask
@@ -25,6 +26,7 @@ from device.recon.reconstructor import (
     Reconstructor,
     RoundDone,
     Step,
+    checked,
     noise_frame,
     steadier,
 )
@@ -122,8 +124,9 @@ class BurstReconstructor:
         Raises
         ------
         FrameError
-            The frame has no light, or too many missing pixels.
+            The frame has no light, too many missing pixels, or rows that are repeated or missing.
         """
+        counts = self.single.lines(counts, dark).counts
         look = self.single.quick_look(counts, dark)
         require_light(look)
         seen = None if alone else self.joiner.see(counts, dark, look)
@@ -144,7 +147,7 @@ class BurstReconstructor:
         eye_psf: EyePsf = EyePsf.ESTIMATED,
         joined: JoinedFrame | None = None,
     ) -> Iterator[Step]:
-        """Yield the quick look of the first frame, RoundDone after frames and rounds, and the picture of the burst.
+        """Yield the quick look of the first usable frame, RoundDone after frames and rounds, and the burst's picture.
 
         Each frame that is not prepared and each round is followed by RoundDone. The deadline moves by the time until
         the consumer continues after it. A burst of one usable frame gives the picture of that frame; a deadline that
@@ -177,8 +180,7 @@ class BurstReconstructor:
         Raises
         ------
         FrameError
-            A frame has another shape, the first one has too many missing pixels for a quick look, or no frame
-            can be used.
+            A frame before the first usable one has another shape, or no frame can be used.
         """
         run = _Run(self, deadline, eye_psf, joined)
         ready = dict(prepared or {})
@@ -195,27 +197,42 @@ class BurstReconstructor:
                 look=looks.get(0),
             )
             return
-        if 0 not in looks:
-            looks[0] = self.single.quick_look(frames[0], dark)
-        yield looks[0].stage
+        first, unusable = self._first_look(frames, dark, dict(unusable or {}), looks)
+        yield looks[first].stage
         if joined is None and not run.fits(self._cost_s(frames, ready, unusable) + self.single.stages[-1].least_s):
             self.see_cost.halve_maximum()
             self.join_cost.halve_maximum()
-            reasons = unusable or {}
-            uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, reasons.get(k)) for k in range(len(frames))]
-            yield from run.solve_one(frames[0], dark, uses, 0, simulated, tasks.get(0), looks[0])
+            uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, unusable.get(k)) for k in range(len(frames))]
+            yield from run.solve_one(frames[first], dark, uses, first, simulated, tasks.get(first), looks[first])
             return
         made = yield from self._solve(run, frames, dark, unusable, ready, looks, simulated)
         quality = made.report.quality
         cost_s = self._cost_s(frames, (), unusable) + sum(made.report.seconds.values())
         if (is_banded(quality) or "flicker" in quality) and run.fits(cost_s):
-            steady, flicker = self._without_flicker(frames, dark, unusable or {})
+            steady, flicker = self._without_flicker(frames, dark, unusable)
             if flicker is not None:
-                looks = {0: self.single.quick_look(steady[0], dark)}
+                looks = {first: self.single.quick_look(steady[first], dark)}
                 run = _Run(self, run.deadline, eye_psf)
                 again = yield from self._solve(run, steady, dark, unusable, {}, looks, simulated)
                 made = steadier(made, again, flicker)
         yield made
+
+    def _first_look(
+        self, frames: Sequence[Pixels], dark: Pixels | None, unusable: dict[int, str], looks: dict[int, QuickLook]
+    ) -> tuple[int, dict[int, str]]:
+        """Add the quick look of the first frame that has one to `looks`; return its index, and all unusable frames."""
+        for k, frame in enumerate(frames):
+            checked(frame, self.single.shape)
+            try:
+                if k not in looks and k not in unusable:
+                    looks[k] = self.single.quick_look(frame, dark)
+            except FrameError as error:
+                unusable[k] = error.message
+                if k == len(frames) - 1:
+                    raise
+            if k in looks:
+                return k, unusable
+        raise FrameError("no frame of the burst can be used", "Take the burst again.")
 
     def _without_flicker(
         self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str]
@@ -254,7 +271,7 @@ class BurstReconstructor:
         if len(used) == 1:
             steps = run.solve_one(frames[used[0]], dark, uses, used[0], simulated, *known)
         else:
-            saturated = looks[0].solved.frame.saturated
+            saturated = looks[min(looks)].solved.frame.saturated
             steps = run.solve_joined([frames[k] for k in used], dark, saturated, simulated, *known)
         for step in steps:
             if isinstance(step, Reconstruction):

@@ -44,6 +44,7 @@ from device.recon.estimation.refraction.estimator import (
 )
 from device.recon.estimation.refraction.notation import report_of, scatter_of
 from device.recon.estimation.refraction.task import RefractionTask
+from device.recon.estimation.sensor_lines import LineFinder
 from device.recon.estimation.spots import Spots, on_sensor
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.compiled import read_only
@@ -348,9 +349,9 @@ class Reconstructor:
             ]
             self.defects = DefectFinder(calibration, shape, psf_index)
         self.flicker = FlickerFinder(self.defects.dark, calibration.sensor.white_dn)
+        self.lines = LineFinder(self.defects.dark, calibration.sensor.white_dn, calibration.psfs[psf_index])
         self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
-        self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
         self._find_cost = DurationEstimate()
         self._refocus_cost = DurationEstimate()
         self._cylinder_cost = DurationEstimate()
@@ -410,7 +411,7 @@ class Reconstructor:
         Raises
         ------
         FrameError
-            The frame has another shape than the sensor, or too many pixels are missing.
+            The frame has another shape than the sensor, too many pixels are missing, or rows are repeated or missing.
         """
         steps = self.steps(counts, dark, simulated=simulated, deadline=deadline, rounds=rounds, quick=quick)
         (picture,) = deque(steps, maxlen=1)
@@ -473,9 +474,11 @@ class Reconstructor:
         Raises
         ------
         FrameError
-            The frame has another shape than the sensor, or too many pixels are missing (`Preprocessor`).
+            The frame has another shape than the sensor, too many pixels are missing (`Preprocessor`), or rows are
+            repeated or missing (`RowOrder`).
         """
         asked = _Asked(simulated, quick, joined, eye_psf)
+        counts, noise = self.lines(checked(counts, self.shape), dark)
         run = _Run(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
         made = yield from self._solve(run, asked, _Known(refraction, others, look))
@@ -487,7 +490,8 @@ class Reconstructor:
                 other = _Run(self, steady.counts, dark, run.deadline, rounds)
                 better = steadier(made, (yield from self._solve(other, asked, _Known())), steady.flicker)
                 made, run = (made, run) if better is made else (better, other)
-        yield (yield from _without_spots(self, run, asked, made, solving_s))
+        made = yield from _without_spots(self, run, asked, made, solving_s)
+        yield replace(made, report=replace(made.report, quality=made.report.quality | noise)) if noise else made
 
     def _solve(self, run: "_Run", asked: "_Asked", known: "_Known") -> Generator[Step, None, Reconstruction]:
         """Yield the steps before the picture, and return the picture."""
@@ -500,9 +504,9 @@ class Reconstructor:
             yield known.look.stage
             stages = stages[1:]
         for stage in stages:
-            if stage is self._refracted[0] and not asked.quick and asked.eye_psf is EyePsf.ESTIMATED:
+            if stage is _refracted(self.stages)[0] and not asked.quick and asked.eye_psf is EyePsf.ESTIMATED:
                 task = self._estimate_refraction(run, task, known.others)
-            elif stage is self._refracted[0] and asked.eye_psf is EyePsf.STORED:
+            elif stage is _refracted(self.stages)[0] and asked.eye_psf is EyePsf.STORED:
                 self._refocus(None)
             if not run.has_time_for(stage):
                 break
@@ -544,7 +548,7 @@ class Reconstructor:
         FrameError
             As `steps`.
         """
-        run = _Run(self, counts, dark, None, None)
+        run = _Run(self, self.lines(checked(counts, self.shape), dark).counts, dark, None, None)
         stage = self.stages[0]
         deque(run.solve(stage, pauses=False, joined=None), maxlen=0)
         assert run.solved is not None
@@ -611,7 +615,7 @@ class Reconstructor:
         if self.refractor is None:
             return None
         find_s = 0.0 if task is not None and task.has_found else self._find_cost.seconds
-        cost_s = find_s + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
+        cost_s = find_s + self._refocus_cost.seconds + run.cost_s(_refracted(self.stages)[0])
         if run.fits(cost_s):
             with_cylinder = run.fits(cost_s + self._cylinder_s)
             if not with_cylinder:
@@ -619,7 +623,7 @@ class Reconstructor:
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
             assert task is not None
             if others and run.deadline is None:
-                task.join([plane(other, 0) for other in others])
+                task.join([self.lines(plane(other, 0), run.dark).counts for other in others])
             run.refraction = task.found()
             self._find_cost.add(task.find_s)
             self._take_cylinder(run, task, wait=run.deadline is None)
@@ -653,7 +657,7 @@ class Reconstructor:
         if self.refractor is None:
             return
         begin_s = self.clock.now_s()
-        for stage in self._refracted:
+        for stage in _refracted(self.stages):
             stage.refocus(stage.model.stored if eye is None else self.refractor.otf(stage.model, eye), eye)
         if eye is not None:
             self._refocus_cost.add(self.clock.now_s() - begin_s)
@@ -820,16 +824,11 @@ class _Known:
 
 
 class _Run:
-    """State of the reconstruction of one frame; FrameError for another shape than the sensor."""
+    """State of the reconstruction of one frame."""
 
     def __init__(
         self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
     ) -> None:
-        check_image_shape(counts.shape)
-        if counts.shape[:2] != owner.shape:
-            raise FrameError(
-                f"the frame has {counts.shape[:2]} pixels, the calibration {owner.shape}", "Use the head's own PSF."
-            )
         self.clock = owner.clock
         self.counts = counts
         self.dark = dark
@@ -951,6 +950,19 @@ class _Run:
         others_s = (channels_left - 1) * (stage.start_cost.seconds + rounds_s + stage.end_cost.seconds)
         ends_s = stage.end_cost.seconds + stage.finish_cost.seconds
         return self.deadline.fits(stage.round_cost.seconds + others_s + ends_s)
+
+
+def checked(counts: Pixels, shape: tuple[int, int]) -> Pixels:
+    """Return the counts, (rows, cols) or (rows, cols, 3); FrameError for other rows and columns than `shape`."""
+    check_image_shape(counts.shape)
+    if counts.shape[:2] != shape:
+        raise FrameError(f"the frame has {counts.shape[:2]} pixels, the calibration {shape}", "Use the head's own PSF.")
+    return counts
+
+
+def _refracted(stages: list[_Stage]) -> list[_Stage]:
+    """Return the stages that use the PSF of the eye."""
+    return stages[min(1, len(stages) - 1) :]
 
 
 def noise_frame(calibration: Calibration, shape: tuple[int, int]) -> Pixels:

@@ -83,6 +83,8 @@ QUALITY: Mapping[str, str] = {
     ),
     "structure_sure": "`structure_nats` in units of its standard error; below -3 the frame came through another PSF.",
     "flicker": "Rms of the gains of the rows, minus 1, that were taken out of the frame; absent without flicker.",
+    "column_noise_dn": "Rms of the noise of the columns that was taken out of the frame, in DN; absent without it.",
+    "row_noise_dn": "Rms of the noise of the rows that was taken out of the frame, in DN; absent without it.",
     "spots": "Share of the frame that no object explains (dust, reflexes) and that was left out; absent without any.",
     "banding": (
         "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered. Of a closed "

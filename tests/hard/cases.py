@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from device.values import Mask
+from device.config.head_file import CameraSpec
+from device.values import Counts, Mask
 from tests.hard import defects
 from tests.hard.frames import Eye, Floats, HardFrame, above_dark, crescent_dark
 from tests.paper.bench import with_changes
@@ -106,6 +107,21 @@ def flicker(share: float) -> Build:
 def bands(share: float) -> Build:
     """Return the builder of a frame with bands of +- `share` (rolling shutter, LEDs dimmed by pulses at 400 Hz)."""
     return lambda eye: eye.clean.with_raw(defects.bands(eye.clean.raw, eye.spec.camera, share))
+
+
+def lines(of: Callable[[Counts, CameraSpec, float], Counts], share: float) -> Build:
+    """Return the builder of a dim frame (250 electrons at the peak) with noise `of` its rows or columns."""
+
+    def build(eye: Eye) -> HardFrame:
+        dim = peak(250)(eye)
+        return dim.with_raw(of(dim.raw, eye.spec.camera, share))
+
+    return build
+
+
+def order_of_rows(of: Callable[[Counts, float], Counts], share: float) -> Build:
+    """Return the builder of a frame in which `share` of the rows is repeated or missing."""
+    return lambda eye: eye.clean.with_raw(of(eye.clean.raw, share))
 
 
 def gain(factor: float) -> Build:
@@ -286,6 +302,24 @@ CASES: tuple[Case, ...] = (
         lambda eye: eye.clean.with_raw(defects.gradient(eye.clean.raw, eye.spec.camera, 0.3)),
         "eye bright",
         PEDESTAL,
+    ),
+    *(
+        _case(f"{name}, {100 * share:g} %", "rows and columns", lines(of, share), true)
+        for name, of, share, true in (
+            ("column noise", defects.column_noise, 0.013, "dim"),
+            ("column noise", defects.column_noise, 0.027, "dim"),
+            ("row noise", defects.row_noise, 0.027, "dim misfit"),
+            ("column gain", defects.column_gain, 0.01, "dim"),
+        )
+    ),
+    *(
+        _case(f"{100 * share:g} % of the rows {name}", "rows and columns", order_of_rows(of, share))
+        for name, of in (
+            ("repeated in a block", defects.repeated_block),
+            ("repeated, spread", defects.repeated_rows),
+            ("lost", defects.lost_rows),
+        )
+        for share in (0.011, 0.022, 0.05)
     ),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),

@@ -106,6 +106,46 @@ def bands(counts: Counts, camera: CameraSpec, share: float, phase: float = 0.3) 
     return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
 
 
+def column_noise(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Add a normal offset to each column, with a standard deviation of `share` of the mean light."""
+    return _as_counts(counts + _line_noise(counts, camera, share, counts.shape[1]), camera)
+
+
+def row_noise(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Add a normal offset to each row, with a standard deviation of `share` of the mean light."""
+    return _as_counts(counts + _line_noise(counts, camera, share, counts.shape[0])[:, None], camera)
+
+
+def column_gain(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Multiply the light of each column by a normal gain of 1 +- `share`."""
+    gain = 1 + share * np.random.default_rng(45).standard_normal(counts.shape[1])
+    return _as_counts(camera.black_dn + (counts - float(camera.black_dn)) * gain, camera)
+
+
+def _line_noise(counts: Counts, camera: CameraSpec, share: float, lines: int) -> NDArray[np.float64]:
+    return np.random.default_rng(44).standard_normal(lines) * share * (float(counts.mean()) - camera.black_dn)
+
+
+def repeated_block(counts: Counts, share: float) -> Counts:
+    """Repeat one row, at 45 % of the height, in the place of the next `share` of the rows."""
+    out, first = counts.copy(), round(0.45 * len(counts))
+    out[first : first + round(share * len(counts))] = counts[first - 1]
+    return out
+
+
+def repeated_rows(counts: Counts, share: float) -> Counts:
+    """Repeat the row before in the place of `share` of the rows, spread evenly."""
+    out, rows = counts.copy(), np.linspace(1, len(counts) - 1, round(share * len(counts))).astype(int)
+    out[rows] = counts[rows - 1]
+    return out
+
+
+def lost_rows(counts: Counts, share: float) -> Counts:
+    """Leave out `share` of the rows at 40 % of the height: those below move up, and the last ones become 0."""
+    first, lost = round(0.4 * len(counts)), round(share * len(counts))
+    return np.concatenate([counts[:first], counts[first + lost :], np.zeros_like(counts[:lost])])
+
+
 def reflex(counts: Counts, camera: CameraSpec) -> Counts:
     """Add a disc of 60 % of the mean light that is not clipped: a reflex that did not pass the diffuser."""
     rows, cols = (np.arange(n) - at * n for n, at in zip(counts.shape, GLARE_AT, strict=True))

@@ -391,6 +391,47 @@ def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Im
 
 
 @compiled
+def line_sums(counts: Pixels, width: int, bands: Image, bins: Image, texture: Image, unknown: Image) -> None:
+    """Add up the rows and columns of a frame; all outputs are 0 before.
+
+    `bands` (bands, cols): sums over equal numbers of rows. `bins` (rows, bins): sums of `width` pixels of a row.
+    `texture` (rows, 2): sums over a row of the squares of its fourth differences, and of their products with those of
+    the row before. `unknown` (rows,): number of its values that are not numbers, in whose place those of the row before
+    are taken.
+    """
+    rows, cols = counts.shape
+    zero = np.float32(0)
+    one = np.float32(1)
+    four = np.float32(4)
+    six = np.float32(6)
+    highest = np.float32(3e38)
+    row = np.zeros(cols, np.float32)
+    before = np.zeros(cols, np.float32)
+    for i in range(rows):
+        band = bands[i * len(bands) // rows]
+        lost = own = shared = zero
+        for j in range(cols):
+            value = np.float32(counts[i, j])
+            known = (value > -highest) & (value < highest)
+            lost += zero if known else one
+            row[j] = value if known else row[j]
+            band[j] += row[j]
+        for k in range(bins.shape[1]):
+            total = zero
+            for j in range(k * width, k * width + width):
+                total += row[j]
+            bins[i, k] = total
+        for j in range(2, cols - 2):
+            fine = row[j - 2] - four * row[j - 1] + six * row[j] - four * row[j + 1] + row[j + 2]
+            own += fine * fine
+            shared += fine * before[j]
+            before[j] = fine
+        texture[i, 0] = own
+        texture[i, 1] = shared
+        unknown[i] = lost
+
+
+@compiled
 def mark_suspects(
     counts: Pixels, dark: Image, slope_dn: float, floor_dn2: float, white_dn: float, least_dn: float, out: Mask
 ) -> int:

@@ -1,0 +1,112 @@
+"""Order of the rows of a frame: rows that repeat others, and places where rows are missing; NUMERICS.md 6.4.
+
+A camera or a driver that loses packets repeats rows or moves the rest up. No object explains such a frame, and no
+weight helps: rows at the wrong place are refused. Noise of neighbouring rows is independent; the PSF makes their light
+alike.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from device.errors import FrameError
+from device.recon.model.kernels import Pixels
+from device.values import Image, Mask
+
+Series = NDArray[np.float64]
+
+MIN_LIKENESS = 0.6  # of the fine texture of two rows, over that of most: independent noise has up to 0.25
+MAX_TEXTURE = 0.3  # likeness of most rows: with more the frame is no raw one (scaled, or smooth)
+MIN_REPEATED = 0.004  # of the rows
+MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
+MIN_VALUES = 16  # different values of a row: dark and saturated rows repeat by chance
+SPANS = 135  # in the height of a frame: rows above and below, whose means are compared
+# Their difference over the largest one near by, of the counts and of the shares of each row's light. Clean frames have
+# up to 1.4 and 1.5, 24 missing rows of 1080 at least 3.4 and 1.8 at 500 electrons at the peak, 12 of them 3 and 2.
+MIN_JUMPS = (1.8, 1.6)
+MIN_LIGHT = 0.2  # of the brightest row
+EVEN = 0.5  # of the brightest of the compared rows: with less it is dead, or the frame ends there
+MIN_SPREAD = 0.25  # of the rows that light of a point reaches: with less the object's own edges stay sharp
+REMEDY = "Take the frame again. If this returns, check the cable of the camera and its driver."
+
+
+class RowOrder:
+    """Test of the order of the rows of frames behind a PSF, given by its `bins` (rows, bins): `Lines.bins`."""
+
+    def __init__(self, psf_bins: Image) -> None:
+        light = psf_bins.mean(axis=1)
+        spread = float((light > MIN_LIGHT * light.max()).mean())
+        steepest = _jumps(psf_bins, 0.0).max(axis=1, initial=0.0) if spread >= MIN_SPREAD else float("inf")
+        self._min_jumps = np.maximum(MIN_JUMPS, steepest)[:, None]
+
+    def __call__(self, counts: Pixels, bins: Image, likeness: Image, unknown: Image) -> None:
+        """Raise FrameError if rows of a frame (rows, cols) are repeated or missing.
+
+        `bins`, `likeness` and `unknown` are those of its `Lines`, `bins` in DN above dark.
+        """
+        rows = np.flatnonzero(_repeated(counts, bins, likeness, unknown))
+        if rows.size >= max(1, MIN_REPEATED * len(bins)):
+            raise FrameError(_words(rows), REMEDY)
+        jumps = _jumps(bins, EVEN)
+        places = np.flatnonzero((jumps > self._min_jumps).all(axis=0))
+        if places.size:
+            row = int(places[np.argmax(jumps[0, places])]) + _span(len(bins))
+            raise FrameError(f"rows are missing or at a wrong place from row {row} on", REMEDY)
+
+
+def _words(rows: np.ndarray) -> str:
+    if rows[-1] - rows[0] == rows.size - 1:
+        return f"rows {rows[0]} to {rows[-1]} repeat other rows of the frame"
+    return f"{rows.size} rows repeat other rows of the frame; the first is row {rows[0]}"
+
+
+def _repeated(counts: Pixels, bins: Image, likeness: Image, unknown: Image) -> Mask:
+    """Return the rows that repeat an earlier one, exactly, or the one before with other read noise."""
+    found = np.zeros(len(bins), np.bool_)
+    usable = (np.ptp(bins, axis=1) > 0) & (unknown == 0)
+    texture = float(np.median(likeness)) if likeness.size else 0.0
+    light = bins.mean(axis=1)
+    lit = light > MIN_LIGHT * light.max()  # in dark rows a rest of the noise of columns exceeds that of pixels
+    if texture < MAX_TEXTURE:
+        found[1:] = (likeness > texture + MIN_LIKENESS) & (usable & lit)[1:]
+    first: dict[bytes, int] = {}
+    for i in np.flatnonzero(usable):
+        k = first.setdefault(bins[i].tobytes(), int(i))
+        if k < i and np.array_equal(counts[i], counts[k]) and np.unique(counts[i]).size >= MIN_VALUES:
+            found[i] = True
+    return found
+
+
+def _span(rows: int) -> int:
+    return max(3, rows // SPANS)
+
+
+def _jumps(bins: Image, even: float) -> Series:
+    """Return how much more the means of the rows above and below each place differ than near it, (2, places).
+
+    As they are, and in shares of each row's light, in which a gain of some rows is no jump. A place is a row with
+    `_span` rows above it, from the first such row on. 0 where rows are not lit, or where one of those that are compared
+    has less than `even` of the light of the brightest.
+    """
+    span = _span(len(bins))
+    if len(bins) < 8 * span:
+        return np.zeros((2, 0))
+    light = bins.mean(axis=1)
+    floor = MIN_LIGHT * max(float(light.max()), float(np.finfo(np.float32).tiny))
+    bright = np.maximum(light, floor)
+    left = np.array([_steps(rows, span) for rows in (bins, bins / bright[:, None])])
+    padded = np.pad(left, ((0, 0), (3 * span, 3 * span)), mode="edge")
+    largest = ndimage.maximum_filter1d(padded, 2 * span + 1, axis=1)
+    places = left.shape[1]
+    near = np.maximum(largest[:, span : span + places], largest[:, 5 * span : 5 * span + places])
+    windows = np.lib.stride_tricks.sliding_window_view(light, places).T  # (places, 2 span)
+    least, most = windows.min(axis=1), windows.max(axis=1)
+    lit = (least > floor) & (least >= even * most) & (near > 0)
+    return np.asarray(np.divide(left, near, out=np.zeros_like(left), where=lit))
+
+
+def _steps(rows: Image, span: int) -> Image:
+    """Return the variance of the difference between the means of `span` rows above and below each place, (places,)."""
+    count = len(rows) - span + 1
+    means = np.asarray(sum(rows[k : k + count] for k in range(span))) / np.float32(span)
+    return np.asarray((means[span:] - means[:-span]).var(axis=1))

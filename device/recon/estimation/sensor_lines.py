@@ -1,0 +1,147 @@
+"""Faults of the rows and columns of a sensor in one frame: rows out of order, noise of rows and of columns.
+
+Both are measured in one pass over the counts. NUMERICS.md 6.3.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from device.recon.estimation.line_noise import BANDS, LineNoise, line_noise
+from device.recon.estimation.row_order import MAX_REPEATED, RowOrder
+from device.recon.model import kernels
+from device.recon.model.compiled import read_only
+from device.recon.model.kernels import Pixels
+from device.values import Image, Psf
+
+BINS = 100  # across the sensor
+SAME = 0.999  # likeness of two equal rows, with the rounding of single precision
+
+
+class Lines(NamedTuple):
+    """Sums of a frame that hold what its rows and columns have in common.
+
+    Attributes
+    ----------
+    bands
+        Means of BANDS groups of rows in DN, (BANDS, cols); of fewer rows than that, each is a group.
+    bins
+        Means of neighbouring pixels of each row in DN, (rows, about BINS).
+    likeness
+        Correlation of the fine texture of each row, from the second on, with that of the row before, (rows - 1,).
+    unknown
+        Number of the values of each row that are not numbers, (rows,).
+    """
+
+    bands: Image
+    bins: Image
+    likeness: Image
+    unknown: Image
+
+
+def lines_of(counts: Pixels) -> Lines:
+    """Return the sums of a frame (rows, cols), uint16 or float32 of any unit."""
+    rows, cols = counts.shape
+    groups = min(BANDS, rows)
+    width = max(1, cols // BINS)
+    bands, bins = np.zeros((groups, cols), np.float32), np.zeros((rows, cols // width), np.float32)
+    texture, unknown = np.zeros((rows, 2), np.float32), np.zeros(rows, np.float32)
+    kernels.line_sums(_contiguous(counts), width, bands, bins, texture, unknown)
+    members = np.bincount(np.arange(rows) * groups // rows).astype(np.float32)
+    own = np.sqrt(texture[1:, 0]) * np.sqrt(texture[:-1, 0])
+    likeness = np.asarray(np.divide(texture[1:, 1], own, out=np.zeros_like(own), where=own > 0), np.float32)
+    return Lines(
+        np.asarray(bands / members[:, None], np.float32),
+        np.asarray(bins / np.float32(width), np.float32),
+        likeness,
+        unknown,
+    )
+
+
+def _contiguous(counts: Pixels) -> Pixels:
+    if counts.dtype == np.uint16:
+        return read_only(np.ascontiguousarray(counts, np.uint16))
+    return read_only(np.ascontiguousarray(counts, np.float32))
+
+
+class EvenFrame(NamedTuple):
+    """Counts without the noise of rows and columns, and the rms of what was taken out by names in a report, in DN."""
+
+    counts: Pixels
+    figures: dict[str, float]
+
+
+class LineFinder:
+    """Search for faults of rows and columns in frames with this dark frame, white level and PSF.
+
+    `dark`: (rows, cols) or (1, cols), float32 DN.
+    """
+
+    def __init__(self, dark: Image, white_dn: float, psf: Psf) -> None:
+        self._dark, self._white_dn = dark, white_dn
+        self._dark_lines = lines_of(dark)
+        self._order = RowOrder(lines_of(psf.pixels).bins)
+
+    def __call__(self, counts: Pixels, dark: Pixels | None = None) -> EvenFrame:
+        """Return a frame, (rows, cols) or (rows, cols, 3), without the noise of its rows and columns, if it has any.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32.
+        dark
+            Dark frame of this shot, of the same shape; None: that of the calibration.
+
+        Returns
+        -------
+        EvenFrame
+            The same counts without such noise, else float32; saturated pixels keep their counts.
+
+        Raises
+        ------
+        FrameError
+            Rows are repeated or missing.
+        """
+        if counts.ndim == 2:
+            return self._even(counts, dark)
+        darks = [None if dark is None else dark[..., c] for c in range(counts.shape[2])]
+        channels = [self._even(counts[..., c], channel_dark) for c, channel_dark in enumerate(darks)]
+        if not any(channel.figures for channel in channels):
+            return EvenFrame(counts, {})
+        names = {name for channel in channels for name in channel.figures}
+        figures = {name: max(channel.figures.get(name, 0.0) for channel in channels) for name in sorted(names)}
+        return EvenFrame(np.stack([np.asarray(channel.counts, np.float32) for channel in channels], -1), figures)
+
+    def _even(self, counts: Pixels, dark: Pixels | None) -> EvenFrame:
+        offset = self._dark if dark is None else np.asarray(dark, np.float32)
+        dark_lines = self._dark_lines if dark is None else lines_of(dark)
+        lines = lines_of(counts)
+        if (lines.likeness > SAME).mean() > MAX_REPEATED:  # a scaled file
+            return EvenFrame(counts, {})
+        columns = line_noise(lines.bands - dark_lines.bands)
+        rows = line_noise(_row_bands(lines.bins - dark_lines.bins))
+        even = EvenFrame(counts, {})
+        if columns is not None or rows is not None:
+            even = self._without(counts, offset, {"column_noise_dn": columns, "row_noise_dn": rows})
+            lines = lines_of(even.counts)  # noise of columns makes rows alike
+        self._order(even.counts, lines.bins - dark_lines.bins, lines.likeness, lines.unknown)
+        return even
+
+    def _without(self, counts: Pixels, offset: Image, noises: Mapping[str, LineNoise | None]) -> EvenFrame:
+        """Return the counts without the noise of the columns, the first one, and of the rows."""
+        light = np.asarray(counts - offset, np.float32)
+        for axis, noise in enumerate(noises.values()):
+            if noise is not None:
+                offset_dn, gain = (np.expand_dims(part, axis) for part in (noise.offset_dn, noise.gain))
+                light = (light - offset_dn) / gain
+        below = np.nextafter(np.float32(self._white_dn), np.float32(0))
+        even = np.where(counts >= self._white_dn, np.float32(self._white_dn), np.minimum(light + offset, below))
+        figures = {name: noise.rms_dn for name, noise in noises.items() if noise is not None}
+        return EvenFrame(np.asarray(even, np.float32), figures)
+
+
+def _row_bands(bins: Image) -> Image:
+    """Return the means of BANDS groups of columns, (BANDS, rows)."""
+    groups = [group.mean(axis=1) for group in np.array_split(bins, BANDS, axis=1) if group.size]
+    return np.asarray(groups, np.float32)
