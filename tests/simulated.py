@@ -69,6 +69,7 @@ def coarse(spec: InstrumentSpec, k: int) -> InstrumentSpec:
     }
     flaws = {
         "dsnu_e": k * sim.sensor.dsnu_e,
+        "column_noise_e": k**1.5 * sim.sensor.column_noise_e,
         "dark_e_per_s": k**2 * sim.sensor.dark_e_per_s,
         "line_s": k * sim.sensor.line_s,
     }

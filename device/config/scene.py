@@ -135,13 +135,18 @@ class EyeSpec(Table):
 
 
 class LightFlaws(Table):
-    """Flaws of the illumination: ambient and stray light, corneal reflex, unequal LEDs, ring offset, falloff."""
+    """Flaws of the illumination: ambient and stray light, ghost, reflex, unequal or pulsed LEDs, falloff."""
 
     ambient: float = Field(default=0.0, ge=0, le=10)  # light without the lamp, share of the mean signal
     stray: float = Field(default=0.0, ge=0, le=10)  # even light with the lamp, share of the mean signal
+    stray_gradient: float = Field(default=0.0, ge=0, le=10)  # of even light: from 0 at the left edge to this, right
+    ghost: float = Field(default=0.0, ge=0, le=1)  # of the light, in a second image by the beam splitter
+    ghost_deg: tuple[float, float] = (2.0, 1.0)  # displacement of the second image, right and down
     polariser_leak: float = Field(default=0.0, ge=0, le=1)  # of the corneal reflex, through crossed polarisers
     ring_um: float = Field(default=9500.0, gt=0, le=20000)  # diameter of the LED ring, before the relay
     led_spread: float = Field(default=0.0, ge=0, le=1)  # from one LED of the ring to the next
+    pwm_hz: float = Field(default=0.0, ge=0, le=1e6)  # pulses that dim the LEDs; 0: a constant current
+    pwm_duty: float = Field(default=0.5, gt=0, le=1)  # share of the time in which a pulsed LED is on
     ring_offset_um: float = Field(default=0.0, ge=-50000, le=50000)  # of the ring from the pupil's conjugate plane
     dead_led: int | None = Field(default=None, ge=0, le=255)  # this LED of the ring stays dark
     falloff: bool = False  # Lambert and the eye's cos^3 towards the field's edge (OPTICS.md 3.5)
@@ -149,10 +154,15 @@ class LightFlaws(Table):
 
 
 class SensorFlaws(Table):
-    """Flaws of the sensor: PRNU, DSNU, dark current, hot pixels, nonlinearity, rolling shutter, Bayer mosaic."""
+    """Flaws of the sensor: fixed patterns, dust, dark current, hot pixels, nonlinearity, rolling shutter, mosaic."""
 
     prnu: float = Field(default=0.0, ge=0, le=0.2)  # spread of the pixels' response
     dsnu_e: float = Field(default=0.0, ge=0, le=1000)
+    column_noise_e: float = Field(default=0.0, ge=0, le=1000)  # spread of the columns' offsets
+    gain_step: float = Field(default=0.0, ge=-0.5, le=0.5)  # of the right half, since the flat frame
+    dust_spots: int = Field(default=0, ge=0, le=1000)  # shadows, since the flat frame
+    dust_um: float = Field(default=200.0, gt=0, le=5000)  # diameter of a shadow
+    dust_shade: float = Field(default=0.35, ge=0, le=1)  # share of the light that a shadow takes
     dark_e_per_s: float = Field(default=0.0, ge=0, le=1e5)  # at 25 C
     dark_doubling_c: float = Field(default=7.0, gt=0, le=100)
     hot_pixels: float = Field(default=0.0, ge=0, le=0.05)  # their share

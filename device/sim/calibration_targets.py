@@ -46,5 +46,5 @@ def point(
 
 def _with_response(world: World, light: Image) -> Image:
     """Return the light multiplied by the pixels' relative response; unchanged if the response is uniform."""
-    response = world.setup(world.spec.light.colour).response
+    response = world.setup(world.spec.light.colour).whole_response
     return light if response is None else light * response

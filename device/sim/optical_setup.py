@@ -172,6 +172,33 @@ class AddedLight:
     lit_e_per_s: float = 0.0
 
 
+class Ghost(NamedTuple):
+    """Second image: its share of the light, and its displacement in pixels."""
+
+    share: float
+    right_px: int
+    down_px: int
+
+
+@dataclass
+class CalibrationDifference:
+    """Difference between calibration and exposure: the calibration has a source of `source_um`, and none of the others.
+
+    `source_um` is the diameter of its point source. `ghost` is a second image. `light_of_rows` gives the light of the
+    rows over the mean, (rows, 1), for the beginning of an exposure and its length, s; None: it is even. `response`
+    multiplies that of the pixels in the flat frame, (rows, cols).
+    """
+
+    source_um: float = 0.0
+    ghost: Ghost | None = None
+    light_of_rows: Callable[[float, float], Image] | None = None
+    response: Image | None = None
+
+    def multiply_response(self, factor: Image) -> None:
+        """Multiply the response of the pixels since the flat frame by `factor`, (rows, cols)."""
+        self.response = factor if self.response is None else self.response * factor
+
+
 @dataclass
 class OpticalSetup:
     """Light path, ideal when built: a green object, one wavelength, a sensor without noise or flaws.
@@ -179,8 +206,8 @@ class OpticalSetup:
     `object` is the radiance on a square as wide as the light. `aberrations` and `beams` map a place in the field to the
     additional refraction, and to the shift of the beam's centre against the iris's, um. `lines` is the number of
     wavelengths. `drift_px` is the movement of the image in one exposure (right, down), `lag_px` that to the right
-    between two rows. `response` multiplies each pixel's light. `source_um` is the diameter of the calibration's point
-    source, `spent_ms` the computing time. Keys of the dicts are names of effects.
+    between two rows. `response` multiplies each pixel's light as in the flat frame. `spent_ms` is the computing time.
+    Keys of the dicts are names of effects.
     """
 
     scene: Scene
@@ -197,7 +224,7 @@ class OpticalSetup:
     added_light: AddedLight = field(default_factory=AddedLight)
     response: Image | None = None
     dark_e_per_s: float = 0.0
-    source_um: float = 0.0
+    calibrated: CalibrationDifference = field(default_factory=CalibrationDifference)
     spent_ms: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -209,8 +236,14 @@ class OpticalSetup:
         """(rows, cols) of the sensor."""
         return self.scene.spec.camera.rows, self.scene.spec.camera.cols
 
+    @property
+    def whole_response(self) -> Image | None:
+        """Response of the pixels in an exposure, (rows, cols): that of the flat frame times its change since."""
+        parts = [part for part in (self.response, self.calibrated.response) if part is not None]
+        return None if not parts else parts[0] if len(parts) == 1 else parts[0] * parts[1]
+
     def multiply_response(self, factor: Image) -> None:
-        """Multiply the relative response of the pixels by `factor`, (rows, cols)."""
+        """Multiply the relative response of the pixels by `factor`, (rows, cols); the flat frame contains it."""
         self.response = factor if self.response is None else self.response * factor
 
     @contextmanager

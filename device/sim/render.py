@@ -16,7 +16,7 @@ from scipy.special import j1
 from device.config.head_file import OpticsSpec
 from device.config.scene import DiffuserSpec
 from device.optics.diffuser import RANDOM_SURFACE, Beam, Refraction, caustic
-from device.sim.optical_setup import OpticalSetup, Place
+from device.sim.optical_setup import Ghost, OpticalSetup, Place
 from device.values import Image
 
 LIT_THRESHOLD = 0.05  # of the peak: threshold of the lit pixels
@@ -50,7 +50,8 @@ def electrons_per_s(setup: OpticalSetup) -> Image:
     for name, veil in added.veils.items():
         with setup.timed(name):
             electrons += veil * np.float32(added.lit_e_per_s)
-    return electrons if setup.response is None else electrons * setup.response
+    response = setup.whole_response
+    return electrons if response is None else electrons * response
 
 
 def _gain_e(setup: OpticalSetup, image: Image) -> float:
@@ -109,18 +110,24 @@ def _image_on_sensor(setup: OpticalSetup) -> Image:
         parts = [(part, psf(setup, place)) for place, part in zones(setup)]
         rows, cols = setup.shape
         margin = ceil(abs(setup.lag_px) * rows / 2)  # columns beside the sensor that a rolling shutter may shift in
-        image = convolved(parts, (rows, cols + 2 * margin), setup.drift_px)
+        image = convolved(parts, (rows, cols + 2 * margin), setup.drift_px, setup.calibrated.ghost)
     if setup.lag_px:
         with setup.timed("shutter"):
             image = _shear_rows(image, setup.lag_px)[:, margin : margin + cols]
     return image
 
 
-def convolved(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drift_px: Place = (0.0, 0.0)) -> Image:
+def convolved(
+    parts: Sequence[tuple[Image, Image]],
+    shape: tuple[int, int],
+    drift_px: Place = (0.0, 0.0),
+    ghost: Ghost | None = None,
+) -> Image:
     """Return the image on a sensor of `shape` of parts of an object, each convolved with its PSF, with motion blur.
 
     `parts` are pairs of part and PSF; all parts have one shape and one centre, and all PSFs have one shape. `drift_px`
-    (right, down) is the length of the blur. Values below 1e-6 of the peak are set to 0.
+    (right, down) is the length of the blur; `ghost` adds the image once more.
+    Values below 1e-6 of the peak are set to 0.
     """
     part, point = parts[0]
     full = part.shape[0] + point.shape[0] - 1, part.shape[1] + point.shape[1] - 1
@@ -136,6 +143,9 @@ def convolved(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drif
     whole = fft.irfft2(total, (rows, cols), overwrite_x=True, workers=2)[: full[0], : full[1]]
     middle = part.shape[0] // 2 + point.shape[0] // 2, part.shape[1] // 2 + point.shape[1] // 2
     arriving = crop_or_pad(whole, shape, middle)
+    if ghost is not None:
+        displaced = middle[0] - ghost.down_px, middle[1] - ghost.right_px
+        arriving += np.float32(ghost.share) * crop_or_pad(whole, shape, displaced)
     arriving[arriving < ROUNDOFF * float(whole.max())] = 0
     return arriving
 

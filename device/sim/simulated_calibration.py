@@ -73,7 +73,7 @@ def calibration_point(world: World, moved_mm: float = 0.0, colour: Colour | None
         point_setup.optics = setup.optics.model_copy(update={"diffuser_to_sensor_um": spec.diffuser_to_sensor_um})
     point = psf(point_setup)
     scale = setup.optics.angular_magnification * setup.optics.diffuser_to_sensor_um
-    on_sensor_um = setup.source_um * scale / (1000 * (eye_mm + moved_mm))
+    on_sensor_um = setup.calibrated.source_um * scale / (1000 * (eye_mm + moved_mm))
     return convolved_with_disc(point, on_sensor_um / world.spec.camera.pitch_um) if on_sensor_um else point
 
 

@@ -171,6 +171,9 @@ class World:
         if closed > 0:
             lid = np.full(self.shape, np.mean(returned), np.float32)
             returned = lid if closed == 1 else np.float32(closed) * lid + np.float32(1 - closed) * returned
+        light_of_rows = self.setup(illumination.colour).calibrated.light_of_rows
+        if light_of_rows is not None:
+            returned = light_of_rows(begin_s, exposure_s) * returned
         return returned * np.float32(illumination.level * exposure_s) + unlit_e
 
     @property
@@ -190,4 +193,5 @@ class World:
             return 0.0
         self.electrons_per_s(self.spec.light.colour)  # sets lit_e_per_s, the reference of the share
         room_e_per_s = added.ambient * added.lit_e_per_s
-        return room_e_per_s if setup.response is None else np.float32(room_e_per_s) * setup.response
+        response = setup.whole_response
+        return room_e_per_s if response is None else np.float32(room_e_per_s) * response

@@ -110,6 +110,12 @@ NEAR = {  # keys that give an effect a size of 0.05 to 0.6, most of them near 0.
     "motion": {"eye": {"drift_deg_per_s": 2.0}},
     "shutter": {"eye": {"drift_deg_per_s": 1.0}, "sensor": {"line_s": 2e-5}},
     "stray": {"light": {"stray": 4e-4}},
+    "gradient": {"light": {"stray_gradient": 4e-4}},
+    "pwm": {"light": {"pwm_hz": 405.0, "pwm_duty": 0.99}, "sensor": {"line_s": 6e-5}},
+    "ghost": {"light": {"ghost": 1e-3, "ghost_deg": (8.0, 0.0)}},
+    "dust": {"sensor": {"dust_spots": 14, "dust_shade": 1e-3}},
+    "gain_step": {"sensor": {"gain_step": 3e-4}},
+    "columns": {"sensor": {"column_noise_e": 2.0}},
     "ambient": {"light": {"ambient": 4e-4}},
     "leds": {"light": {"ring_offset_um": 1350.0, "dead_led": 3}},
     "reflex": {"eye": {"shown_by": "human eye"}, "light": {"polariser_leak": 1e-4, "ring_um": 4000.0}},
@@ -124,6 +130,9 @@ NEAR = {  # keys that give an effect a size of 0.05 to 0.6, most of them near 0.
     "tilt": {"eye": {"retina_tilt_deg": (0.3, 0.2)}},
     "tear_film": {"eye": {"tear_film_per_s": 0.005, "since_blink_s": 20.0}},
 }
+
+
+LOOSEST = {"stray": 3, "ambient": 3, "dark": 3}  # predicted over measured eta, measured 1.5 to 2.6; others: 12
 
 
 @pytest.fixture(scope="module", params=["healthy", "crowded_imx296", "dim"])
@@ -142,7 +151,7 @@ def test_eta_formula_is_a_tight_upper_bound_near_the_threshold(plain: Proof, nam
     measured = seen_by_itself(near, name)
     record_property(name, f"{predicted:.4f} {measured:.4f}")
     assert 0 < measured < predicted + ROUNDING
-    assert predicted < 12 * measured
+    assert predicted < LOOSEST.get(name, 12) * measured
 
 
 class Counted:

@@ -15,7 +15,7 @@ from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import Preprocessor
 from device.sim.effects import EFFECTS
 from device.sim.effects.eye import curvature_dpt, reflex_blobs, reflex_deg
-from device.sim.effects.illumination import leds_mm, lit_share
+from device.sim.effects.illumination import leds_mm, lit_share, pulse_light, pulse_swing
 from device.sim.effects.sensor import hot_pixels
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene, Size
@@ -37,6 +37,14 @@ KEYS = [  # effect, table, key, growing values, further keys of the scene
     ("leds", "light", "ring_offset_um", (0.0, -1500.0, -3000.0), {"light": {"dead_led": 3}}),
     ("stray", "light", "stray", (0.0, 1e-3, 0.1), {}),
     ("ambient", "light", "ambient", (0.0, 1e-3, 0.1), {}),
+    ("gradient", "light", "stray_gradient", (0.0, 1e-3, 0.6), {}),
+    ("pwm", "light", "pwm_hz", (0.0, 20005.0, 405.0), {"sensor": {"line_s": 3e-5}}),
+    ("pwm", "sensor", "line_s", (0.0, 3e-5), {"light": {"pwm_hz": 405.0}}),
+    ("ghost", "light", "ghost", (0.0, 1e-3, 0.3), {}),
+    ("dust", "sensor", "dust_spots", (0, 1, 14), {}),
+    ("gain_step", "sensor", "gain_step", (0.0, 1e-3, 0.02), {}),
+    ("gain_step", "sensor", "gain_step", (0.0, -1e-3, -0.02), {}),
+    ("columns", "sensor", "column_noise_e", (0.0, 0.5, 4.0), {}),
     ("refraction", "eye", "m_dpt", (0.0, 0.1, 1.0, 5.0), {}),
     ("refraction", "eye", "m_dpt", (0.0, -0.1, -5.0), {}),
     ("refraction", "eye", "j45_dpt", (0.0, 0.5, 1.0), {}),
@@ -540,10 +548,68 @@ def test_led_positions_are_those_of_the_heads_matrix() -> None:
     assert np.hypot(*np.transpose(at)) == pytest.approx(np.full(8, 10.04 / 2), abs=0.1)
 
 
-class Dust:
+def shares(**keys: dict[str, object]) -> np.ndarray:
+    """Return the noise-free light of a frame with changed keys over that without, where there is enough of it."""
+    changed, plain = (expected_electrons(world(with_keys(PLAIN, **more))) for more in (keys, {}))
+    return changed / np.where(plain > 0.02 * plain.max(), plain, np.nan)
+
+
+def test_pulsed_leds_give_bands_of_rows_whose_range_has_a_closed_form() -> None:
+    exposure_s = PLAIN.camera.exposure_s
+    seen = shares(light={"pwm_hz": 105.0, "pwm_duty": 0.3}, sensor={"line_s": 1e-4})
+    rows = np.nanmean(seen, axis=1)
+    rows = rows[np.isfinite(rows)]
+    assert np.nanstd(seen - np.nanmean(seen, axis=1, keepdims=True)) < 2e-3
+    assert (rows.max() - rows.min()) / 2 == pytest.approx(pulse_swing(105.0, 0.3, exposure_s), rel=0.02)
+    assert pulse_swing(105.0, 0.3, exposure_s) == pytest.approx(0.5 / 10.5)  # half a period of ten and a half
+    assert pulse_swing(100.0, 0.3, exposure_s) == pytest.approx(0, abs=1e-12)  # whole periods
+    every = pulse_light(np.linspace(0, 1 / 105, 1000, endpoint=False), exposure_s, 105.0, 0.3)
+    assert every.mean() == pytest.approx(1, abs=1e-4)
+
+
+def test_dust_and_a_gain_step_are_not_in_the_flat_frame_and_a_pattern_is() -> None:
+    spec = with_keys(PLAIN, sensor={"dust_spots": 14, "gain_step": 0.02})
+    assert simulated_calibration(world(spec)).flat is None
+    both = with_keys(spec, sensor={"prnu": 0.01})
+    flats = [simulated_calibration(world(with_keys(of, sensor={"prnu": 0.01}))).flat for of in (PLAIN, both)]
+    assert np.array_equal(*flats)
+    seen = shares(sensor={"dust_spots": 14, "dust_shade": 0.35})
+    assert np.nanmin(seen) == pytest.approx(0.65, abs=0.01)
+    assert np.nanmedian(seen) == pytest.approx(1, abs=0.01)
+    left, right = np.array_split(shares(sensor={"gain_step": 0.02}), 2, axis=1)
+    assert (np.nanmean(left), np.nanmean(right)) == pytest.approx((1, 1.02), abs=1e-3)
+
+
+def test_a_ghost_is_the_image_once_more() -> None:
+    at = (3.0, -2.0)
+    spec = with_keys(PLAIN, light={"ghost": 0.25, "ghost_deg": at})
+    single, double = (dot(spec, name)[1] for name in ("shot", "ghost"))
+    away = np.rint(np.multiply(at, scene(spec).geometry.px_per_deg)).astype(int)
+    both = single + 0.25 * np.roll(single, (away[1], away[0]), axis=(0, 1))
+    assert double / double.max() == pytest.approx(both / both.max(), abs=1e-4)
+
+
+def test_stray_light_with_a_gradient_is_a_plane() -> None:
+    spec = with_keys(PLAIN, light={"stray_gradient": 0.6})
+    more = expected_electrons(world(spec)) - expected_electrons(world(PLAIN))
+    mean_e = world(spec)  # the mean of the lit pixels
+    expected_electrons(mean_e)
+    lit_e = mean_e.setup("green").added_light.lit_e_per_s * spec.camera.exposure_s
+    cols = np.median(more, axis=0)
+    assert cols == pytest.approx(0.6 * lit_e * np.linspace(0, 1, cols.size), abs=0.01 * lit_e)
+
+
+def test_column_noise_is_one_offset_for_each_column() -> None:
+    offset_e = world(with_keys(PLAIN, sensor={"column_noise_e": 20.0})).sensor.offset_e
+    assert offset_e is not None
+    assert np.ptp(offset_e, axis=0).max() == 0
+    assert offset_e[0].std() == pytest.approx(20, rel=0.15)
+
+
+class Bubbles:
     """Dark spot at a fixed place: the example of device/sim/README.md."""
 
-    name = "dust"
+    name = "bubbles"
 
     def size(self, scene: Scene) -> Size:
         return Size(1.0, "a spot of 40 pixels")
@@ -555,12 +621,12 @@ class Dust:
 
 
 def test_an_additional_effect_is_planned_simulated_and_listed() -> None:
-    dusty = world(PLAIN, effects=(*EFFECTS, Dust()))
-    darker = expected_electrons(dusty) / np.maximum(expected_electrons(world(PLAIN)), 1)
+    bubbly = world(PLAIN, effects=(*EFFECTS, Bubbles()))
+    darker = expected_electrons(bubbly) / np.maximum(expected_electrons(world(PLAIN)), 1)
     assert darker[100:140, 200:240] == pytest.approx(0.5, abs=1e-3)
     assert darker[150:170, 200:240] == pytest.approx(1.0, abs=1e-3)
-    assert re.search(r"^dust +simulated +1 +a spot of 40 pixels$", format_plan(dusty.plan), re.MULTILINE)
-    left_out = world(PLAIN, effects=(*EFFECTS, Dust()), without=["dust"])
+    assert re.search(r"^bubbles +simulated +1 +a spot of 40 pixels$", format_plan(bubbly.plan), re.MULTILINE)
+    left_out = world(PLAIN, effects=(*EFFECTS, Bubbles()), without=["bubbles"])
     assert np.array_equal(expected_electrons(left_out), expected_electrons(world(PLAIN)))
 
 

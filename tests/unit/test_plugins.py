@@ -37,7 +37,7 @@ from tests.simulated import small_head_toml
 SHAPE = (48, 64)
 CALIBRATION = scenes.calibration(scenes.speckle(SHAPE))
 COUNTS = np.random.default_rng(0).integers(500, 1500, SHAPE).astype(np.uint16)
-DUST = "[sim]\n[sim.effects.dust]\nspots = 30\n"
+BUBBLES = "[sim]\n[sim.effects.bubbles]\nspots = 30\n"
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def own_solver(tmp_path: Path) -> Iterator[None]:
 
 @pytest.fixture
 def own_effect(tmp_path: Path) -> Iterator[None]:
-    with installed(tmp_path, "own_effect", OWN_EFFECT, plugins.EFFECTS, dust="EFFECT"):
+    with installed(tmp_path, "own_effect", OWN_EFFECT, plugins.EFFECTS, bubbles="EFFECT"):
         yield
 
 
@@ -279,9 +279,9 @@ def test_a_broken_plug_in_does_not_disturb_other_methods(tmp_path: Path) -> None
 # Effects
 
 
-def scene_file(folder: Path, tables: str = DUST) -> Path:
+def scene_file(folder: Path, tables: str = BUBBLES) -> Path:
     path = folder / "scene.toml"
-    path.write_text(small_head_toml("dusty", tables, summed=4))
+    path.write_text(small_head_toml("bubbly", tables, summed=4))
     return path
 
 
@@ -292,34 +292,34 @@ def explained(spec: InstrumentSpec) -> dict[str, float]:
 @pytest.mark.usefixtures("own_effect")
 def test_an_installed_effect_is_decided_by_its_eta_and_simulated(tmp_path: Path) -> None:
     spec = load_head(scene_file(tmp_path))
-    assert explained(spec)["dust"] > 0.05
-    dusty = simulate(spec, tmp_path / "dusty")
-    plan = json.loads((tmp_path / "dusty" / "plan.json").read_text())
-    assert plan["dust"]["simulated"] is True
-    assert plan["dust"]["why"].startswith("30 discs cover")
-    response = dusty.setup(spec.light.colour).response
+    assert explained(spec)["bubbles"] > 0.05
+    bubbly = simulate(spec, tmp_path / "bubbly")
+    plan = json.loads((tmp_path / "bubbly" / "plan.json").read_text())
+    assert plan["bubbles"]["simulated"] is True
+    assert plan["bubbles"]["why"].startswith("30 discs cover")
+    response = bubbly.setup(spec.light.colour).response
     assert response is not None
     assert response.min() == 0.5
-    assert explained(load_head(scene_file(tmp_path, "[sim]\n[sim.effects.dust]\n")))["dust"] == 0
-    assert "dust" not in explained(load_head(scene_file(tmp_path, "[sim]\n")))
+    assert explained(load_head(scene_file(tmp_path, "[sim]\n[sim.effects.bubbles]\n")))["bubbles"] == 0
+    assert "bubbles" not in explained(load_head(scene_file(tmp_path, "[sim]\n")))
 
 
 def test_a_scene_that_names_a_missing_effect_is_refused(tmp_path: Path) -> None:
     path = scene_file(tmp_path)
-    line = path.read_text().splitlines().index("[sim.effects.dust]") + 1
+    line = path.read_text().splitlines().index("[sim.effects.bubbles]") + 1
     with pytest.raises(SpecError) as error:
         load_head(path)
     assert error.value.message == (
-        f"{path}, line {line}: sim.effects.dust: no installed package has the effect 'dust' (installed: none); install "
-        "the package that declares it under diffuscope.effects, or remove this table"
+        f"{path}, line {line}: sim.effects.bubbles: no installed package has the effect 'bubbles' (installed: none); "
+        "install the package that declares it under diffuscope.effects, or remove this table"
     )
 
 
 WRONG_SETTINGS = {
-    "[sim.effects.dust]\nspots = 2000\n": "[sim.effects.dust]: spots: Input should be less than or equal to 1000, "
-    "not 2000; allowed: at least 0, at most 1000",
-    "[sim.effects.dust]\nspot = 2\n": "[sim.effects.dust]: 'spot' is not a known key; did you mean 'spots'?",
-    "[sim.effects]\ndust = 2\n": "an effect of a plug-in has a table [sim.effects.dust], not 2",
+    "[sim.effects.bubbles]\nspots = 2000\n": "[sim.effects.bubbles]: spots: Input should be less than or equal to "
+    "1000, not 2000; allowed: at least 0, at most 1000",
+    "[sim.effects.bubbles]\nspot = 2\n": "[sim.effects.bubbles]: 'spot' is not a known key; did you mean 'spots'?",
+    "[sim.effects]\nbubbles = 2\n": "an effect of a plug-in has a table [sim.effects.bubbles], not 2",
 }
 
 
@@ -333,22 +333,22 @@ def test_wrong_settings_of_an_effect_name_table_and_key(tables: str, tmp_path: P
 
 WRONG_EFFECTS = {
     "1 / 0": "cannot be loaded: ZeroDivisionError",
-    "EFFECT = Dust": "is the class Dust; declare an object of it",
+    "EFFECT = Bubbles": "is the class Bubbles; declare an object of it",
     "EFFECT = 3": "is of type int, without `name` of the interface Effect",
-    "Dust.name = 'sand'": "is an effect of another name, 'sand'",
-    "Dust.size = lambda self, scene: 1.0": "gave the size 1.0; it is a Size",
-    "Dust.size = lambda self, scene: Size(float('nan'), 'x')": "gave the size Size(eta=nan",
-    "Dust.size = lambda self, scene: 1 / 0": "cannot give its size: ZeroDivisionError",
-    "Dust.apply = lambda self, setup: 1 / 0": "cannot be applied: ZeroDivisionError",
-    "Dust.apply = lambda self, setup: setup.multiply_response(np.ones((2, 2)))": "whose response is no finite array",
+    "Bubbles.name = 'sand'": "is an effect of another name, 'sand'",
+    "Bubbles.size = lambda self, scene: 1.0": "gave the size 1.0; it is a Size",
+    "Bubbles.size = lambda self, scene: Size(float('nan'), 'x')": "gave the size Size(eta=nan",
+    "Bubbles.size = lambda self, scene: 1 / 0": "cannot give its size: ZeroDivisionError",
+    "Bubbles.apply = lambda self, setup: 1 / 0": "cannot be applied: ZeroDivisionError",
+    "Bubbles.apply = lambda self, setup: setup.multiply_response(np.ones((2, 2)))": "whose response is no finite array",
 }
 
 
 @pytest.mark.parametrize("line", WRONG_EFFECTS)
 def test_a_wrong_effect_is_refused_in_one_sentence(line: str, tmp_path: Path) -> None:
     with (
-        installed(tmp_path, "own", f"{OWN_EFFECT}\n{line}\n", plugins.EFFECTS, dust="EFFECT"),
+        installed(tmp_path, "own", f"{OWN_EFFECT}\n{line}\n", plugins.EFFECTS, bubbles="EFFECT"),
         pytest.raises(SettingError) as error,
     ):
         simulate(load_head(scene_file(tmp_path)), tmp_path / "out")
-    refuses(error.value, WRONG_EFFECTS[line], "the effect 'dust' of the package own 0.1", "EFFECT")
+    refuses(error.value, WRONG_EFFECTS[line], "the effect 'bubbles' of the package own 0.1", "EFFECT")

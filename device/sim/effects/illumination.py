@@ -1,4 +1,4 @@
-"""Effects of the illumination: penumbra, falloff, single LEDs of the ring, stray light, ambient light.
+"""Effects of the illumination: penumbra, falloff, single and pulsed LEDs of the ring, stray light, ambient light.
 
 Ring that is not conjugate to the eye's pupil (`Leds`). With f1 and f2 the lenses, a = f1 / f2, the relay is afocal: a
 ray that leaves an LED at rho (mm off the axis) under the slope psi enters the eye under theta = -psi / a, whatever its
@@ -30,6 +30,8 @@ from device.values import Image
 STRAY_ETA_PER_SHARE = 320.0  # of the mean signal, where no constant is fitted; a solver that fits one sees less
 _FALLOFF_ETA = 7.0  # at 33.4 degrees on a sensor that the field fills, where the edge keeps 0.84 of the light
 _FALLOFF_TABLE_LOSS = 1 - cos(radians(16.7)) ** 4
+_GRADIENT_ETA_PER_SHARE = 200.0
+_PWM_ETA_PER_SHARE = 2200.0  # of half the range of the rows' light
 _LEDS_ETA_PER_SHARE = 180.0  # of the standard deviation over the field, relative to the mean
 _RADII, _TURNS = 48, 48  # polar grid on which the light over the field is evaluated for the size
 _EDGE_STEPS = 65  # of the soft edge's table
@@ -195,6 +197,49 @@ def lit_share(scene: Scene, right_deg: NDArray[np.float64], down_deg: NDArray[np
     return np.asarray(lit)
 
 
+class Pwm:
+    """Pulse-width modulation (PWM) of the LEDs before a rolling shutter: bands of rows; OPTICS.md 3.5."""
+
+    name = "pwm"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to half the range of the rows' light; 0 with a global shutter."""
+        light, line_s = scene.sim.light, scene.sim.sensor.line_s
+        if not (light.pwm_hz and line_s):
+            return Size(0.0, "all rows see the same pulses" if light.pwm_hz else "the LEDs' current is constant")
+        half = pulse_swing(light.pwm_hz, light.pwm_duty, scene.spec.camera.exposure_s)
+        why = f"pulses at {light.pwm_hz:g} Hz: the light of the rows varies by +-{half:.2%}"
+        return Size(_PWM_ETA_PER_SHARE * half * scene.weight, why)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Set the light of each row over the mean, for an exposure that begins at a time of the clock."""
+        light, line_s = setup.scene.sim.light, setup.scene.sim.sensor.line_s
+        if not (light.pwm_hz and line_s):
+            return
+        starts_s = line_s * np.arange(setup.shape[0], dtype=np.float64)
+
+        def light_of_rows(begin_s: float, exposure_s: float) -> Image:
+            return pulse_light(begin_s + starts_s, exposure_s, light.pwm_hz, light.pwm_duty)[:, None]
+
+        setup.calibrated.light_of_rows = light_of_rows
+
+
+def pulse_light(begin_s: NDArray[np.float64], exposure_s: float, pwm_hz: float, duty: float) -> Image:
+    """Return the light of pulses within exposures that begin at `begin_s`, over the mean, in its shape; OPTICS.md 3.5.
+
+    A pulse begins at time 0, and lasts for `duty` (above 0, up to 1) of a period.
+    """
+    begin, end = pwm_hz * begin_s, pwm_hz * (begin_s + exposure_s)
+    on = [np.floor(at) * duty + np.minimum(at % 1, duty) for at in (begin, end)]
+    return np.asarray((on[1] - on[0]) / (pwm_hz * exposure_s * duty), np.float32)
+
+
+def pulse_swing(pwm_hz: float, duty: float, exposure_s: float) -> float:
+    """Return half the range of `pulse_light` over all beginnings, a share of its mean; OPTICS.md 3.5."""
+    rest = pwm_hz * exposure_s % 1
+    return (min(rest, duty) - max(rest + duty - 1, 0)) / (2 * pwm_hz * exposure_s * duty)
+
+
 class Stray:
     """Stray light: constant veiling glare from scatter in lenses and walls while the lamp is on; OPTICS.md 3.7."""
 
@@ -208,6 +253,23 @@ class Stray:
     def apply(self, setup: OpticalSetup) -> None:
         """Add a constant to every pixel while the lamp is on, as a share of the mean signal."""
         setup.added_light.veils[self.name] = setup.scene.sim.light.stray
+
+
+class StrayGradient:
+    """Stray light with a gradient: none at the sensor's left edge, most at its right one; OPTICS.md 3.7."""
+
+    name = "gradient"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the effect's size eta, proportional to the stray light at the right edge over the mean signal."""
+        share = scene.sim.light.stray_gradient
+        why = f"up to {share:.2%} of the mean signal, at the right edge"
+        return Size(_GRADIENT_ETA_PER_SHARE * share * scene.weight, why, CONSTANT_LIGHT)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Add a plane to the veiling light, as a share of the mean signal."""
+        across = np.linspace(0, setup.scene.sim.light.stray_gradient, setup.shape[1], dtype=np.float32)
+        setup.added_light.veils[self.name] = np.broadcast_to(across, setup.shape)
 
 
 class Ambient:

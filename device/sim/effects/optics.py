@@ -1,14 +1,15 @@
-"""Effects of the instrument's optics: vignetting at the iris, bandwidth of the LED, size of the calibration's point."""
+"""Effects of the instrument's optics: vignetting at the iris, LED bandwidth, ghost, size of the calibration's point."""
 
 from math import cos, radians, sin, tan
 
 from device.optics.eye import beam_walk_mm
-from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
+from device.sim.optical_setup import Ghost, OpticalSetup, Place, Scene, Size
 from device.sim.render import azimuth_and_angle
 
 _VIGNETTING_ETA_PER_MM = 220.0  # of the beam's edge inside the iris's: the caustic of the field's edge loses a side
 _BANDWIDTH_ETA_PER_UM = 0.25
 _BANDWIDTH_LINES = 3
+_GHOST_ETA_PER_SHARE = 130.0
 _SOURCE_ETA, _SOURCE_UM, _SOURCE_POWER = 0.89, 275.0, 1.4  # .08, .21, .89 for 50, 100, 275 um
 
 
@@ -74,6 +75,29 @@ class Bandwidth:
         setup.lines = _BANDWIDTH_LINES
 
 
+class SplitterGhost:
+    """Ghost of the beam splitter: a second image, from both faces of a wedged plate; OPTICS.md 3.11.
+
+    The PSF has none: the plate was turned or exchanged after its measurement.
+    """
+
+    name = "ghost"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the effect's size eta, proportional to the light of the second image; 0 if it is not displaced."""
+        light = scene.sim.light
+        away = max(map(abs, light.ghost_deg)) > 0
+        why = f"a second image of {light.ghost:.2%}, {light.ghost_deg[0]:g} deg right and {light.ghost_deg[1]:g} down"
+        return Size(_GHOST_ETA_PER_SHARE * light.ghost * away * scene.weight, why)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Set share and displacement of the second image, in whole pixels."""
+        light, px_per_deg = setup.scene.sim.light, setup.scene.geometry.px_per_deg
+        right_px, down_px = (round(at_deg * px_per_deg) for at_deg in light.ghost_deg)
+        if light.ghost:
+            setup.calibrated.ghost = Ghost(light.ghost, right_px, down_px)
+
+
 class SourceSize:
     """Finite size of the calibration's point source: the measured PSF is convolved with a disc; OPTICS.md 2.5, 3.2."""
 
@@ -89,4 +113,4 @@ class SourceSize:
 
     def apply(self, setup: OpticalSetup) -> None:
         """Set the diameter of the calibration's source, um; objects in a frame are not blurred by it."""
-        setup.source_um = setup.scene.sim.calibration.source_um
+        setup.calibrated.source_um = setup.scene.sim.calibration.source_um

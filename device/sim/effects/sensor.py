@@ -1,12 +1,12 @@
-"""Effects of the sensor: rolling shutter, fixed patterns, Bayer mosaic, noise, dark current, response, saturation."""
+"""Effects of the sensor: rolling shutter, fixed patterns, dust, mosaic, noise, dark current, response, saturation."""
 
 from dataclasses import replace
-from math import hypot, sqrt
+from math import hypot, pi, sqrt
 
 import numpy as np
 
 from device.sim.effects.eye import brightest_reflex
-from device.sim.effects.illumination import STRAY_ETA_PER_SHARE
+from device.sim.effects.illumination import STRAY_ETA_PER_SHARE, pulse_swing
 from device.sim.optical_setup import CONSTANT_LIGHT, OpticalSetup, Scene, Size
 from device.values import Mask
 
@@ -14,6 +14,9 @@ _SHUTTER_ETA_PER_DEG = 12.0  # a skew moves vessels at the top and bottom edge a
 _FILTER_LEAK = 0.1  # transmission of a filter of another colour
 _RGGB_SITES = {"red": ((0, 0),), "green": ((0, 1), (1, 0)), "blue": ((1, 1),)}
 _NONLINEARITY_ETA_PER_SHARE = 140.0
+_DUST_ETA_PER_RMS = 2000.0  # of the missing share of the light over the sensor
+_GAIN_STEP_ETA_PER_SHARE = 420.0
+_COLUMNS_ETA_PER_NOISE = 4.5  # a pattern of columns is as strong along one axis as white noise over both
 _SATURATION_SIGMAS = 6.0  # of its noise, by which the brightest pixel may stay below the well and never reach it
 
 
@@ -35,6 +38,36 @@ class RollingShutter:
         setup.lag_px = scene.sim.eye.drift_deg_per_s * scene.sim.sensor.line_s * scene.geometry.px_per_deg
 
 
+class Dust:
+    """Dust on the sensor: round shadows at places that the seed fixes, which the flat frame does not have yet.
+
+    OPTICS.md 3.8.
+    """
+
+    name = "dust"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the root mean square of the missing share of the light."""
+        sensor, camera = scene.sim.sensor, scene.spec.camera
+        dark_um2 = sensor.dust_spots * pi / 4 * sensor.dust_um**2
+        covered = min(dark_um2 / (camera.rows * camera.cols * camera.pitch_um**2), 1)
+        why = f"{sensor.dust_spots} shadows cover {covered:.2%}"
+        return Size(_DUST_ETA_PER_RMS * sensor.dust_shade * sqrt(covered) * scene.weight, why)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Multiply the response by the shadows of the grains."""
+        sensor = setup.scene.sim.sensor
+        if not sensor.dust_spots:
+            return
+        places = np.random.default_rng((setup.scene.seed, 71)).random((sensor.dust_spots, 2)) * setup.shape
+        rows, cols = np.ogrid[: setup.shape[0], : setup.shape[1]]
+        radius_px = sensor.dust_um / setup.scene.spec.camera.pitch_um / 2
+        light = np.ones(setup.shape, np.float32)
+        for row, col in places:
+            light[np.hypot(rows - row, cols - col) < radius_px] = 1 - sensor.dust_shade
+        setup.calibrated.multiply_response(light)
+
+
 class Prnu:
     """Photo-response non-uniformity (PRNU): fixed-pattern gain 1 + prnu N(0, 1); a flat frame corrects it.
 
@@ -52,6 +85,28 @@ class Prnu:
         """Multiply each pixel's response by this sensor's pattern."""
         draw = np.random.default_rng((setup.scene.seed, 31)).standard_normal(setup.shape, dtype=np.float32)
         setup.multiply_response(np.maximum(1 + np.float32(setup.scene.sim.sensor.prnu) * draw, 0))
+
+
+class GainStep:
+    """Gain step: the right half of the sensor, behind its own amplifier, has another gain than in the flat frame.
+
+    OPTICS.md 3.8.
+    """
+
+    name = "gain_step"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the effect's size eta, proportional to the relative step."""
+        step = scene.sim.sensor.gain_step
+        return Size(_GAIN_STEP_ETA_PER_SHARE * abs(step) * scene.weight, f"{step:.2%} between the halves")
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Multiply the response of the right half."""
+        step = setup.scene.sim.sensor.gain_step
+        if step:
+            gain = np.ones(setup.shape, np.float32)
+            gain[:, setup.shape[1] // 2 :] += np.float32(step)
+            setup.calibrated.multiply_response(gain)
 
 
 class BayerMosaic:
@@ -130,6 +185,25 @@ class Dsnu:
         setup.sensor = setup.sensor.offset_by(np.float32(setup.scene.sim.sensor.dsnu_e) * draw)
 
 
+class ColumnNoise:
+    """Column noise: an offset of each column, column_noise_e N(0, 1), of its own amplifier; OPTICS.md 3.8."""
+
+    name = "columns"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the offsets' standard deviation over the noise of a pixel."""
+        spread_e = scene.sim.sensor.column_noise_e
+        return Size(
+            _COLUMNS_ETA_PER_NOISE * spread_e / scene.noise_e, f"{spread_e:.1f} electrons from column to column"
+        )
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Add the offsets of this sensor's columns."""
+        draw = np.random.default_rng((setup.scene.seed, 41)).standard_normal(setup.shape[1], dtype=np.float32)
+        offset_e = np.float32(setup.scene.sim.sensor.column_noise_e) * draw
+        setup.sensor = setup.sensor.offset_by(np.broadcast_to(offset_e, setup.shape))
+
+
 class HotPixels:
     """Hot pixels: defective pixels with a full well of charge in addition to their light; NUMERICS.md 6.1."""
 
@@ -194,8 +268,11 @@ class Saturation:
         full_e = scene.spec.camera.full_well_e
         flaws = scene.sim.sensor
         exposure_s = scene.spec.camera.exposure_s
-        veils = scene.sim.light.stray + scene.sim.light.ambient + brightest_reflex(scene)
-        even_e = scene.peak_e * (1 + veils) + flaws.dark_e_per_s * exposure_s
+        light = scene.sim.light
+        veils = light.stray + light.stray_gradient + light.ambient + light.ghost + brightest_reflex(scene)
+        bands = pulse_swing(light.pwm_hz, light.pwm_duty, exposure_s) if light.pwm_hz else 0.0
+        even_e = scene.peak_e * (1 + veils) * (1 + bands) * (1 + max(flaws.gain_step, 0))
+        even_e += flaws.dark_e_per_s * exposure_s
         noise_e = sqrt(even_e + scene.spec.camera.read_noise_e**2 + flaws.dsnu_e**2)
         top_e = (even_e * (1 + _SATURATION_SIGMAS * flaws.prnu) + _SATURATION_SIGMAS * noise_e) * (
             1 + max(flaws.nonlinearity, 0)
