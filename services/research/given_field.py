@@ -6,7 +6,7 @@ from device.config.head_file import InstrumentSpec, load_head
 from device.errors import FrameError, SettingError
 from device.optics.lit_angle import has_sharp_edge, picture_field_deg
 from device.recon.assessment.lit_disc import lit_disc_deg
-from device.recon.assessment.quality_figures import MIN_EXPLAINED_LIT, UNEXPLAINED
+from device.recon.assessment.quality_figures import LITTLE_LIGHT, MIN_EXPLAINED_LIT, UNEXPLAINED
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import MAX_EXPLAINED
@@ -39,8 +39,11 @@ class LitField:
 
 
 def is_doubtful(report: Report, options: ReconstructOptions) -> bool:
-    """Return whether the field of a picture is to be compared with its frame: it was given, or the frame is odd."""
-    if options.field_fixed or options.head is None:
+    """Return whether the field of a picture is to be compared with its frame: it was given, or the frame is odd.
+
+    Never in too little light, where the disc's edge is noise.
+    """
+    if options.field_fixed or options.head is None or any(LITTLE_LIGHT in words for words in report.warnings):
         return False
     is_odd = _is_refused(report) or (report.residual or 0.0) > MAX_EXPLAINED or not _is_all_lit(report)
     return options.field_deg is not None or is_odd

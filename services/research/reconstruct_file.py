@@ -423,11 +423,16 @@ def file_report(report: Report, solver: Reconstructor, options: ReconstructOptio
 
 
 def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tuple[str, ...]:
-    """Return what to doubt: a method that was given no field, a residual that neither noise nor `notes` explain."""
+    """Return what to doubt without a known field: a closed form, a residual that neither noise nor `notes` explain.
+
+    With a known field the residual is judged by `quality_warnings`, which allows for stray light.
+    """
+    if np.isfinite(field_radius_px(solver.calibration)):
+        return ()
     found = []
     is_plugin = report.method not in METHODS
     is_closed_form = solver.stages[_place_of(solver, report)].is_closed_form
-    if (is_closed_form or is_plugin) and not np.isfinite(field_radius_px(solver.calibration)):
+    if is_closed_form or is_plugin:
         kind = "plug-in" if is_plugin else "closed form"
         found.append(
             f"No field is known, and the {kind} '{report.method}' takes the whole frame as lit. Where only a disc "

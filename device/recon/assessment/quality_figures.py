@@ -33,6 +33,7 @@ SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
 FAINT_DN = 1e-9
 NO_SIGNAL = "There is no signal in this frame."
 PARTLY_LIT = "of the field is lit"
+LITTLE_LIGHT = "too little light"
 UNEXPLAINED = "The picture does not explain this frame: parts of it may be false."
 # The words of these messages and of `quality_warnings` are sorted by KINDS in tests/hard/judgement.py.
 MISMATCHES = {
@@ -240,5 +241,5 @@ def _words_for_files(quality: dict[str, float | None]) -> dict[str, str]:
         "diffuse": "The light of this frame came from everywhere: most of it did not pass the diffuser as in the PSF.",
         "unexplained": f"{UNEXPLAINED} Flicker and stray light are possible causes.",
         "partly lit": f"Only {quality.get('coverage') or 0:.0%} {PARTLY_LIT}: the rest of the picture is dark.",
-        "too dark": "This frame holds too little light for vessels: what looks like one may be noise.",
+        "too dark": f"This frame holds {LITTLE_LIGHT} for vessels: what looks like one may be noise.",
     }
