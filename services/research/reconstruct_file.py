@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import cast, get_args
 
@@ -19,7 +20,14 @@ from device.config.bayer import BayerOption
 from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.psf_consistency import PsfConsistency
-from device.recon.assessment.quality_figures import MISMATCHES, NO_SIGNAL, PSF_FIGURES, UNEXPLAINED, Audience
+from device.recon.assessment.quality_figures import (
+    MISMATCHES,
+    NO_SIGNAL,
+    PARTLY_LIT,
+    PSF_FIGURES,
+    UNEXPLAINED,
+    Audience,
+)
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction.estimator import NoRefraction
 from device.recon.estimation.refraction.notation import report_of
@@ -194,14 +202,16 @@ class FileReconstructor:
         field = plan.smaller_field(made.report, loaded)
         budget_s = self._options.budget_s
         has_time = budget_s is None or 2 * sum(made.report.seconds.values()) < budget_s
-        if field is not None and has_time:
+        if field is not None and field.diameter_deg is not None and has_time:
             plan = self._plan(loaded, psfs, field.diameter_deg)
             made = self._solved(plan, loaded, dark)
         self._last = plan
+        if plan.is_to_be_judged(made.report):
+            made = replace(made, report=judged(made.report, self._judge(source, dark).report))
         of_field = () if field is None else (field.note(has_time),)
         of_psfs = () if psfs is None else (*psfs.notes, *psfs.damage)
-        if psfs is not None and psfs.damage:
-            made = replace(made, report=without_psf_figures(made.report))
+        if loaded.is_encoded or (psfs is not None and psfs.damage):
+            made = replace(made, report=without_psf_figures(made.report, "the counts of raw or PSF are damaged"))
         of_raw = (*loaded.notes, *head_notes(self._options, loaded))
         notes = (*of_field, *of_raw, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
         warnings = made.report.warnings
@@ -249,6 +259,12 @@ class FileReconstructor:
         if self._last is None or self._last.is_mosaic:
             return slice(None), slice(None)
         return field_box(self._last.calibrations[0], self._last.shape)
+
+    @cached_property
+    def _judge(self) -> "FileReconstructor":
+        """Reconstruction by the default method, whose residual shows what a closed form cannot tell."""
+        options = replace(self._options, method=None, bin=None, rounds=None, settings={}, sweep=None)
+        return FileReconstructor(options, self._planner, timed=self._timed)
 
     def _psfs_for(self, loaded: LoadedRaw) -> LoadedPsfs | None:
         """Return the PSFs for a raw, read at the first raw of its shape; None for an archived calibration."""
@@ -329,6 +345,13 @@ class _FrameSolvers:
         )
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
 
+    def is_to_be_judged(self, report: Report) -> bool:
+        """Return whether a closed form without a deadline doubts the PSF or the field, or its frame is odd."""
+        method = METHODS.get(self._options.method or "")
+        if method is None or method.rounds or self._options.budget_s is not None or self._options.head is None:
+            return False
+        return is_doubtful(report, self._options) or any(map(is_doubt_of_psf_or_field, report.warnings))
+
     def smaller_field(self, report: Report, loaded: LoadedRaw) -> LitField | None:
         """Return the lit disc of a solved raw where it is smaller than the field; SettingError where it is larger."""
         if not is_doubtful(report, self._options):
@@ -336,7 +359,7 @@ class _FrameSolvers:
         pixels = loaded.raw.pixels
         c = _brightest(pixels) if pixels.ndim == 3 else 0
         calibration = self.calibrations[min(c, len(self.calibrations) - 1)]
-        return smaller_field(self._options, calibration, plane(pixels, c), self._planner, report.psf_index)
+        return smaller_field(self._options, calibration, plane(pixels, c), self._planner, report)
 
     def _planned(self, index: int) -> tuple[Reconstructor, ...]:
         """Return a solver for each calibration; all at the finest bin that one of them needs."""
@@ -366,10 +389,31 @@ class _FrameSolvers:
         return index
 
 
-def without_psf_figures(report: FileReport) -> FileReport:
-    """Return the report of a picture with a damaged PSF, without refraction and figures of the spectrum."""
-    refraction = None if report.refraction_dpt is None else report_of(NoRefraction("the PSF is damaged"))
-    quality = {name: None if name in PSF_FIGURES else figure for name, figure in report.quality.items()}
+def is_doubt_of_psf_or_field(warning: str) -> bool:
+    """Return whether a warning says that PSF and frame do not match, or that a part of the field is dark."""
+    return warning in MISMATCHES.values() or PARTLY_LIT in warning
+
+
+def judged(report: FileReport, default: FileReport) -> FileReport:
+    """Return the report of a closed form with the doubts that the default method has of the same frame."""
+    warnings = [warning for warning in report.warnings if not is_doubt_of_psf_or_field(warning)]
+    doubtful = [words for words in default.warnings if is_doubt_of_psf_or_field(words) or words.startswith(UNEXPLAINED)]
+    share = default.quality.get("spots")
+    if share:
+        warnings.append(
+            f"Spots on {share:.1%} of the frame are no part of the retina, and '{report.method}' does not leave them "
+            "out: use the default method. Clean sensor and diffuser."
+        )
+    unexplained = share or any(words in MISMATCHES.values() or words.startswith(UNEXPLAINED) for words in doubtful)
+    report = replace(report, warnings=tuple(dict.fromkeys((*warnings, *doubtful))))
+    return without_psf_figures(report, "the forward model does not explain the frame") if unexplained else report
+
+
+def without_psf_figures(report: FileReport, reason: str) -> FileReport:
+    """Return the report without refraction, which is refused for a reason, and without figures of the spectrum."""
+    refraction = None if report.refraction_dpt is None else report_of(NoRefraction(reason))
+    unknown = (*PSF_FIGURES, "through")
+    quality = {name: None if name in unknown else figure for name, figure in report.quality.items()}
     return replace(report, refraction_dpt=refraction, refraction_scatter=None, quality=quality)
 
 
@@ -379,11 +423,16 @@ def file_report(report: Report, solver: Reconstructor, options: ReconstructOptio
 
 
 def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tuple[str, ...]:
-    """Return what to doubt: a method that was given no field, a residual that neither noise nor `notes` explain."""
+    """Return what to doubt without a known field: a closed form, a residual that neither noise nor `notes` explain.
+
+    With a known field the residual is judged by `quality_warnings`, which allows for stray light.
+    """
+    if np.isfinite(field_radius_px(solver.calibration)):
+        return ()
     found = []
     is_plugin = report.method not in METHODS
     is_closed_form = solver.stages[_place_of(solver, report)].is_closed_form
-    if (is_closed_form or is_plugin) and not np.isfinite(field_radius_px(solver.calibration)):
+    if is_closed_form or is_plugin:
         kind = "plug-in" if is_plugin else "closed form"
         found.append(
             f"No field is known, and the {kind} '{report.method}' takes the whole frame as lit. Where only a disc "

@@ -87,7 +87,8 @@ class LoadedRaw:
 
     `shape` is (rows, cols) of the file, `bayer` the pattern of a mosaic, `black_dn` the black level that the file
     states, `light` the colour for which the PSFs of an archived calibration are chosen (None: all are used). `notes`
-    are sentences for the user. `gamma` is the exponent by which its counts were made linear.
+    are sentences for the user. `gamma` is the exponent by which its counts were made linear; `is_encoded` True for
+    counts that show a gamma or the blocks of a JPEG.
     """
 
     raw: Raw
@@ -99,6 +100,7 @@ class LoadedRaw:
     notes: tuple[str, ...] = ()
     light: Colour | None = None
     gamma: float | None = None
+    is_encoded: bool = False
 
     @property
     def label(self) -> str:

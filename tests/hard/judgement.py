@@ -35,7 +35,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("swapped", ("swapped",)),
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),
-    ("spots", ("dark spots",)),
+    ("spots", ("dark spots", "spots on")),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
     ("counts", ("black level", "gain", "bits", "counts", "jpeg")),

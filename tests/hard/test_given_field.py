@@ -56,3 +56,8 @@ def test_only_a_whole_disc_has_a_radius(seen: float) -> None:
     disc = np.tile(np.clip(20.5 - np.arange(40.0), 0, 1), (16, 1))
     disc[: round(16 * (1 - seen))] = 0
     assert disc_radius(disc) == (pytest.approx(20.0, abs=0.6) if seen == 1 else None)
+
+
+def test_in_too_little_light_nothing_is_said_about_the_field(tmp_path: Path) -> None:
+    made = reconstructed(EYE.frame({"sim.peak_e": 50.0 * EYE.merged**2}), tmp_path, None)
+    assert not any("Only a disc" in warning for warning in made.report.warnings)

@@ -32,6 +32,8 @@ PSF_FIGURES = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_
 SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
 FAINT_DN = 1e-9
 NO_SIGNAL = "There is no signal in this frame."
+PARTLY_LIT = "of the field is lit"
+LITTLE_LIGHT = "too little light"
 UNEXPLAINED = "The picture does not explain this frame: parts of it may be false."
 # The words of these messages and of `quality_warnings` are sorted by KINDS in tests/hard/judgement.py.
 MISMATCHES = {
@@ -227,8 +229,7 @@ def _words_for_operators(quality: dict[str, float | None]) -> dict[str, str]:
         "diffuse": "No eye was seen: the light came from everywhere. Centre the ring on the pupil.",
         "unexplained": f"{UNEXPLAINED} Take it again in steady light.",
         "partly lit": (
-            f"Only {quality.get('coverage') or 0:.0%} of the field is lit. Ask to look at the green light; "
-            "take it again."
+            f"Only {quality.get('coverage') or 0:.0%} {PARTLY_LIT}. Ask to look at the green light; take it again."
         ),
         "too dark": "Too little light came back for vessels. Centre the ring on the pupil; take it again.",
     }
@@ -239,6 +240,6 @@ def _words_for_files(quality: dict[str, float | None]) -> dict[str, str]:
         "saturated": f"{quality['saturated']:.1%} of the pixels are too bright: they are saturated and were left out.",
         "diffuse": "The light of this frame came from everywhere: most of it did not pass the diffuser as in the PSF.",
         "unexplained": f"{UNEXPLAINED} Flicker and stray light are possible causes.",
-        "partly lit": f"Only {quality.get('coverage') or 0:.0%} of the field is lit: the rest of the picture is dark.",
-        "too dark": "This frame holds too little light for vessels: what looks like one may be noise.",
+        "partly lit": f"Only {quality.get('coverage') or 0:.0%} {PARTLY_LIT}: the rest of the picture is dark.",
+        "too dark": f"This frame holds {LITTLE_LIGHT} for vessels: what looks like one may be noise.",
     }
