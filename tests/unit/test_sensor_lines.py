@@ -151,7 +151,7 @@ def test_rows_of_a_scaled_file_and_dead_rows_are_no_repetition() -> None:
 
 
 @pytest.mark.parametrize("scene", ["disc", "full"])
-@pytest.mark.parametrize("lost", [4, 8])
+@pytest.mark.parametrize("lost", [8, 14])
 def test_missing_rows_are_refused_by_name(scene: str, lost: int) -> None:
     frame = counts(LIGHT_DN[scene])
     short = np.concatenate([frame[:140], frame[140 + lost :], np.zeros_like(frame[:lost])])
@@ -163,3 +163,12 @@ def test_a_step_of_the_gain_is_no_missing_row() -> None:
     light = LIGHT_DN["full"].copy()
     light[160:] *= 1.1
     assert FINDER(counts(light)).counts.dtype == np.uint16
+
+
+def test_a_spot_and_a_reflex_are_no_missing_or_repeated_rows() -> None:
+    rows, cols = np.indices(SHAPE)
+    spot = np.hypot(rows - 160, cols - 150) < 20
+    dark, bright = counts(LIGHT_DN["full"]), counts(LIGHT_DN["full"] + np.float32(500) * spot)
+    dark[spot] = 0
+    for frame in (dark, bright):
+        assert FINDER(frame).counts is frame

@@ -20,10 +20,13 @@ MAX_TEXTURE = 0.3  # likeness of most rows: with more the frame is no raw one (s
 MIN_REPEATED = 0.004  # of the rows
 MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
 MIN_VALUES = 16  # different values of a row: dark and saturated rows repeat by chance
+SEGMENTS = 8  # of a row, so that a spot, which lies in few, does not decide
+SEEN = 3  # of them must show a jump
 SPANS = 135  # in the height of a frame: rows above and below, whose means are compared
-# Their difference over the largest one near by, of the counts and of the shares of each row's light. Clean frames have
-# up to 1.4 and 1.5, 24 missing rows of 1080 at least 3.4 and 1.8 at 500 electrons at the peak, 12 of them 3 and 2.
+# Their difference over the largest one near by, of the counts and of the shares of a segment's light. Clean frames have
+# up to 1.3 and 1.3, reflexes and dust 1.6 and 1.5, bright frames without 24 of 1080 rows at least 3.2 and 2.6.
 MIN_JUMPS = (1.8, 1.6)
+FAINT = 1e-9
 MIN_LIGHT = 0.2  # of the brightest row
 EVEN = 0.5  # of the brightest of the compared rows: with less it is dead, or the frame ends there
 MIN_SPREAD = 0.25  # of the rows that light of a point reaches: with less the object's own edges stay sharp
@@ -84,29 +87,34 @@ def _span(rows: int) -> int:
 def _jumps(bins: Image, even: float) -> Series:
     """Return how much more the means of the rows above and below each place differ than near it, (2, places).
 
-    As they are, and in shares of each row's light, in which a gain of some rows is no jump. A place is a row with
-    `_span` rows above it, from the first such row on. 0 where rows are not lit, or where one of those that are compared
-    has less than `even` of the light of the brightest.
+    As they are, and in shares of the light of each row's segment, in which a gain of some rows is no jump; the SEEN-th
+    largest of the segments. A place is a row with `_span` rows above it, from the first such row on. 0 where rows are
+    not lit, or where one of those that are compared has less than `even` of the light of the brightest.
     """
     span = _span(len(bins))
-    if len(bins) < 8 * span:
+    if len(bins) < 8 * span or bins.shape[1] < SEGMENTS:
         return np.zeros((2, 0))
     light = bins.mean(axis=1)
-    floor = MIN_LIGHT * max(float(light.max()), float(np.finfo(np.float32).tiny))
-    bright = np.maximum(light, floor)
-    left = np.array([_steps(rows, span) for rows in (bins, bins / bright[:, None])])
-    padded = np.pad(left, ((0, 0), (3 * span, 3 * span)), mode="edge")
-    largest = ndimage.maximum_filter1d(padded, 2 * span + 1, axis=1)
-    places = left.shape[1]
-    near = np.maximum(largest[:, span : span + places], largest[:, 5 * span : 5 * span + places])
+    floor = MIN_LIGHT * max(float(light.max()), FAINT)
+    width = bins.shape[1] // SEGMENTS
+    parts = bins[:, : SEGMENTS * width].reshape(len(bins), SEGMENTS, width)
+    bright = np.maximum(parts.mean(axis=2, keepdims=True), np.float32(floor))
+    left = np.array([_steps(rows, span) for rows in (parts, parts / bright)])
+    padded = np.pad(left, ((0, 0), (0, 0), (3 * span, 3 * span)), mode="edge")
+    largest = ndimage.maximum_filter1d(padded, 2 * span + 1, axis=2)
+    places = left.shape[2]
+    near = np.maximum(largest[..., span : span + places], largest[..., 5 * span : 5 * span + places])
     windows = np.lib.stride_tricks.sliding_window_view(light, places).T  # (places, 2 span)
     least, most = windows.min(axis=1), windows.max(axis=1)
     lit = (least > floor) & (least >= even * most) & (near > 0)
-    return np.asarray(np.divide(left, near, out=np.zeros_like(left), where=lit))
+    return np.sort(np.divide(left, near, out=np.zeros_like(left), where=lit), axis=1)[:, -SEEN]
 
 
 def _steps(rows: Image, span: int) -> Image:
-    """Return the variance of the difference between the means of `span` rows above and below each place, (places,)."""
+    """Return the variance of the difference between the means of `span` rows above and below each place.
+
+    `rows`: (rows, segments, bins); the result is (segments, places).
+    """
     count = len(rows) - span + 1
     means = np.asarray(sum(rows[k : k + count] for k in range(span))) / np.float32(span)
-    return np.asarray((means[span:] - means[:-span]).var(axis=1))
+    return np.asarray((means[span:] - means[:-span]).var(axis=2).T)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from device.recon.estimation.line_noise import BANDS, LineNoise, line_noise
-from device.recon.estimation.row_order import MAX_REPEATED, RowOrder
+from device.recon.estimation.row_order import MAX_REPEATED, SEGMENTS, RowOrder
 from device.recon.model import kernels
 from device.recon.model.compiled import read_only
 from device.recon.model.kernels import Pixels
@@ -29,7 +29,8 @@ class Lines(NamedTuple):
     bins
         Means of neighbouring pixels of each row in DN, (rows, about BINS).
     likeness
-        Correlation of the fine texture of each row, from the second on, with that of the row before, (rows - 1,).
+        Correlation of the fine texture of each row, from the second on, with that of the row before, median over the
+        segments of a row, (rows - 1,).
     unknown
         Number of the values of each row that are not numbers, (rows,).
     """
@@ -46,17 +47,13 @@ def lines_of(counts: Pixels) -> Lines:
     groups = min(BANDS, rows)
     width = max(1, cols // BINS)
     bands, bins = np.zeros((groups, cols), np.float32), np.zeros((rows, cols // width), np.float32)
-    texture, unknown = np.zeros((rows, 2), np.float32), np.zeros(rows, np.float32)
+    texture, unknown = np.zeros((rows, SEGMENTS, 2), np.float32), np.zeros(rows, np.float32)
     kernels.line_sums(_contiguous(counts), width, bands, bins, texture, unknown)
     members = np.bincount(np.arange(rows) * groups // rows).astype(np.float32)
-    own = np.sqrt(texture[1:, 0]) * np.sqrt(texture[:-1, 0])
-    likeness = np.asarray(np.divide(texture[1:, 1], own, out=np.zeros_like(own), where=own > 0), np.float32)
-    return Lines(
-        np.asarray(bands / members[:, None], np.float32),
-        np.asarray(bins / np.float32(width), np.float32),
-        likeness,
-        unknown,
-    )
+    own = np.sqrt(texture[1:, :, 0]) * np.sqrt(texture[:-1, :, 0])
+    likeness = np.asarray(np.divide(texture[1:, :, 1], own, out=np.zeros_like(own), where=own > 0), np.float32)
+    bands, bins = np.asarray(bands / members[:, None], np.float32), np.asarray(bins / np.float32(width), np.float32)
+    return Lines(bands, bins, np.asarray(np.median(likeness, axis=1), np.float32), unknown)
 
 
 def _contiguous(counts: Pixels) -> Pixels:

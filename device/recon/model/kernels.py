@@ -395,9 +395,9 @@ def line_sums(counts: Pixels, width: int, bands: Image, bins: Image, texture: Im
     """Add up the rows and columns of a frame; all outputs are 0 before.
 
     `bands` (bands, cols): sums over equal numbers of rows. `bins` (rows, bins): sums of `width` pixels of a row.
-    `texture` (rows, 2): sums over a row of the squares of its fourth differences, and of their products with those of
-    the row before. `unknown` (rows,): number of its values that are not numbers, in whose place those of the row before
-    are taken.
+    `texture` (rows, segments, 2): sums over a segment of a row of the squares of its fourth differences, and of their
+    products with those of the row before. `unknown` (rows,): number of its values that are not numbers, in whose place
+    those of the row before are taken.
     """
     rows, cols = counts.shape
     zero = np.float32(0)
@@ -405,11 +405,12 @@ def line_sums(counts: Pixels, width: int, bands: Image, bins: Image, texture: Im
     four = np.float32(4)
     six = np.float32(6)
     highest = np.float32(3e38)
+    segments = texture.shape[1]
     row = np.zeros(cols, np.float32)
     before = np.zeros(cols, np.float32)
     for i in range(rows):
         band = bands[i * len(bands) // rows]
-        lost = own = shared = zero
+        lost = zero
         for j in range(cols):
             value = np.float32(counts[i, j])
             known = (value > -highest) & (value < highest)
@@ -421,13 +422,15 @@ def line_sums(counts: Pixels, width: int, bands: Image, bins: Image, texture: Im
             for j in range(k * width, k * width + width):
                 total += row[j]
             bins[i, k] = total
-        for j in range(2, cols - 2):
-            fine = row[j - 2] - four * row[j - 1] + six * row[j] - four * row[j + 1] + row[j + 2]
-            own += fine * fine
-            shared += fine * before[j]
-            before[j] = fine
-        texture[i, 0] = own
-        texture[i, 1] = shared
+        for k in range(segments):
+            own = shared = zero
+            for j in range(2 + k * (cols - 4) // segments, 2 + (k + 1) * (cols - 4) // segments):
+                fine = row[j - 2] - four * row[j - 1] + six * row[j] - four * row[j + 1] + row[j + 2]
+                own += fine * fine
+                shared += fine * before[j]
+                before[j] = fine
+            texture[i, k, 0] = own
+            texture[i, k, 1] = shared
         unknown[i] = lost
 
 
