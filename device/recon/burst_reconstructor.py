@@ -32,7 +32,8 @@ from device.recon.reconstructor import (
 )
 from device.values import FrameUse, Reconstruction
 
-NO_TIME = "the time budget left no time to join the burst"
+NO_TIME = "the time budget left no time to join it"
+NOT_SOLVED = "the time budget left no time to solve the joined frames"
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,8 @@ class BurstReconstructor:
         """Yield the quick look of the first usable frame, RoundDone after frames and rounds, and the burst's picture.
 
         Each frame that is not prepared and each round is followed by RoundDone. The deadline moves by the time until
-        the consumer continues after it. A burst of one usable frame gives the picture of that frame; a deadline that
-        leaves no time to join them, and to solve the joined frame with one round, gives that of the first.
+        the consumer continues after it. A burst of one usable frame gives the picture of that frame. A deadline that
+        leaves no time to join all frames, and to solve the joined one in some rounds, joins fewer, or uses the first.
 
         Parameters
         ----------
@@ -197,9 +198,10 @@ class BurstReconstructor:
                 look=looks.get(0),
             )
             return
-        first, unusable = self._first_look(frames, dark, dict(unusable or {}), looks)
+        first, known_bad = self._first_look(frames, dark, dict(unusable or {}), looks)
         yield looks[first].stage
-        if joined is None and not run.fits(self._cost_s(frames, ready, unusable) + self.single.stages[-1].least_s):
+        unusable = known_bad if joined else self._within_time(run, frames, ready, known_bad)
+        if NO_TIME in unusable.values() and len(unusable) == len(frames) - 1:
             self.see_cost.halve_maximum()
             self.join_cost.halve_maximum()
             uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, unusable.get(k)) for k in range(len(frames))]
@@ -233,6 +235,20 @@ class BurstReconstructor:
             if k in looks:
                 return k, unusable
         raise FrameError("no frame of the burst can be used", "Take the burst again.")
+
+    def _within_time(
+        self, run: "_Run", frames: Sequence[Pixels], ready: Container[int], unusable: Mapping[int, str]
+    ) -> dict[int, str]:
+        """Return the reasons of the unusable frames, with the last ones that the deadline leaves no time to join.
+
+        Rounds on fewer frames are worth more than a joined frame that is not solved.
+        """
+        reasons = dict(unusable)
+        usable = [k for k in range(len(frames)) if k not in reasons]
+        solving_s = self.single.stages[-1].reserved_s
+        while len(usable) > 1 and not run.fits(self._cost_s(frames, ready, reasons) + solving_s):
+            reasons[usable.pop()] = NO_TIME
+        return reasons
 
     def _without_flicker(
         self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str]
@@ -271,8 +287,7 @@ class BurstReconstructor:
         if len(used) == 1:
             steps = run.solve_one(frames[used[0]], dark, uses, used[0], simulated, *known)
         else:
-            saturated = looks[min(looks)].solved.frame.saturated
-            steps = run.solve_joined([frames[k] for k in used], dark, saturated, simulated, *known)
+            steps = run.solve_joined([frames[k] for k in used], dark, simulated, *known)
         for step in steps:
             if isinstance(step, Reconstruction):
                 return step
@@ -369,12 +384,11 @@ class _Run:
         self,
         used: Sequence[Pixels],
         dark: Pixels | None,
-        saturated: float | None,
         simulated: bool,
         refraction: RefractionTask | None,
         look: QuickLook | None,
     ) -> Iterator[Step]:
-        """Yield the steps of the picture of the joined frames `used`; the last arguments are the first frame's."""
+        """Yield the steps of the picture of the joined frames `used`; `refraction` and `look` are the first one's."""
         owner = self._owner
         joined = self.joined
         assert joined is not None
@@ -394,11 +408,10 @@ class _Run:
             if isinstance(step, RoundDone):
                 yield step
             elif isinstance(step, Reconstruction) and is_solved:
-                quality = step.report.quality | {"saturated": saturated}
-                made = replace(step, report=replace(step.report, quality=quality))
-                yield self._reported(in_one_exposure(made, joined.light), joined.frames)
+                yield self._reported(in_one_exposure(step, joined.light), joined.frames)
             elif isinstance(step, Reconstruction):  # no time for the last stage: this is the picture of one frame
-                yield self._reported(step, only(next(use.index for use in joined.frames if use.used), joined.frames))
+                index = next(use.index for use in joined.frames if use.used)
+                yield self._reported(step, only(index, joined.frames, NOT_SOLVED))
             elif step.last:  # the quick look was that of the first frame
                 is_solved = True
                 yield replace(step, picture=step.picture / np.float32(joined.light))
@@ -452,14 +465,14 @@ def in_one_exposure(made: Reconstruction, light: float) -> Reconstruction:
     return replace(made, picture=made.picture / np.float32(light), report=report)
 
 
-def only(index: int, uses: Sequence[FrameUse]) -> tuple[FrameUse, ...]:
+def only(index: int, uses: Sequence[FrameUse], reason: str = NO_TIME) -> tuple[FrameUse, ...]:
     """Return the uses of the frames of a burst for a picture of frame `index` alone.
 
-    `uses` are those known so far; each other frame keeps its reason, or has NO_TIME without one.
+    `uses` are those known so far; each other frame keeps its reason, or has this `reason`.
     """
     return tuple(
         FrameUse(use.index, True, (0.0, 0.0), 1.0)
         if use.index == index
-        else replace(use, used=False, weight=0.0, reason=use.reason or NO_TIME)
+        else replace(use, used=False, weight=0.0, reason=use.reason or reason)
         for use in uses
     )

@@ -66,6 +66,7 @@ DUST = (
     "Dark spots, {share:.1%} of the frame, were left out; the largest is at row {row}, column {col} of the sensor. "
     "Clean sensor and diffuser; if they stay, measure the flat frame again."
 )
+RESERVED_ROUNDS = 6  # kept free for the last stage: half of a picture's rounds give it all but 0.02 dB
 CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
 
 
@@ -254,6 +255,11 @@ class _Stage:
         """Estimated minimum duration for one channel, seconds: start, one round, end and finish."""
         ends_s = self.end_cost.seconds + self.finish_cost.seconds
         return self.start_cost.seconds + self.round_cost.seconds + ends_s
+
+    @property
+    def reserved_s(self) -> float:
+        """Estimated duration for one channel with the rounds that refraction and joining must leave time for."""
+        return self.least_s + max(min(RESERVED_ROUNDS, self.most) - 1, 0) * self.round_cost.seconds
 
     def halve_costs(self) -> None:
         """Halve the cost estimates after the stage was skipped; one slow run would otherwise block it forever."""
@@ -615,7 +621,7 @@ class Reconstructor:
         if self.refractor is None:
             return None
         find_s = 0.0 if task is not None and task.has_found else self._find_cost.seconds
-        cost_s = find_s + self._refocus_cost.seconds + run.cost_s(_refracted(self.stages)[0])
+        cost_s = find_s + self._refocus_cost.seconds + run.reserved_s(_refracted(self.stages)[0])
         if run.fits(cost_s):
             with_cylinder = run.fits(cost_s + self._cylinder_s)
             if not with_cylinder:
@@ -857,6 +863,10 @@ class _Run:
         """Return the minimum duration of a stage in seconds: start, one round and finish, for all channels."""
         return self.channels * stage.least_s - (self.channels - 1) * stage.finish_cost.seconds
 
+    def reserved_s(self, stage: _Stage) -> float:
+        """Return the duration of a stage for all channels that is kept free before the refraction begins."""
+        return self.cost_s(stage) + self.channels * (stage.reserved_s - stage.least_s)
+
     @property
     def spots(self) -> Spots | None:
         """Parts of a frame of one channel that its picture does not explain."""
@@ -910,7 +920,12 @@ class _Run:
     def _channel(self, stage: _Stage, c: int, pauses: bool, joined: Image | None) -> Iterator[RoundDone]:
         """Solve one channel of a stage; the diagnostics of the last channel are those of the frame."""
         begin_s = self.clock.now_s()
-        frame = stage.preparer(*self.channel(c)) if joined is None else stage.joined_preparer(plane(joined, c))
+        if joined is None:
+            frame = stage.preparer(*self.channel(c))
+        else:
+            assert self.solved is not None  # a joined frame has no limit: the share is that of its first frame
+            saturated = self.solved.frame.saturated
+            frame = replace(stage.joined_preparer(plane(joined, c)), saturated=saturated)
         stage.solver.start(frame)
         now_s = self.clock.now_s()
         stage.start_cost.add(now_s - begin_s)

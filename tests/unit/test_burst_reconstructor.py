@@ -7,7 +7,7 @@ import pytest
 
 from device.clock import Deadline, SystemClock
 from device.errors import FrameError
-from device.recon.burst_reconstructor import NO_TIME, BurstReconstructor
+from device.recon.burst_reconstructor import NO_TIME, NOT_SOLVED, BurstReconstructor
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor, RoundDone, StageResult
 from device.values import Image, Reconstruction
@@ -143,15 +143,26 @@ class ShortSteps(Deadline):
         return self
 
 
-def test_frames_are_not_joined_without_time_for_a_round_after_it(bursts: BurstReconstructor, frames: list) -> None:
-    """Rounds on one frame are worth more than a joined frame that is not solved."""
+def test_as_many_frames_are_joined_as_leave_time_for_rounds(bursts: BurstReconstructor, frames: list) -> None:
+    """Rounds on fewer frames are worth more than a joined frame that is not solved."""
     picture(bursts, frames)  # measures the cost of each step
-    join_s = COUNT * (bursts.see_cost.seconds + bursts.join_cost.seconds)
-    stage = bursts.single.stages[-1]
-    assert stage.least_s < join_s
-    made = picture(bursts, frames, ShortSteps(SystemClock(), 0.0, join_s + 0.5 * stage.least_s))
-    assert [use.used for use in made.report.frames] == [True, False, False, False]
-    assert (made.report.seconds["join"], made.report.rounds) == (0.0, stage.most)
+    each_s = bursts.see_cost.seconds + bursts.join_cost.seconds
+    reserved_s = bursts.single.stages[-1].reserved_s
+    for count in (3, 1):
+        made = picture(bursts, frames, ShortSteps(SystemClock(), 0.0, (count + 0.5) * each_s + reserved_s))
+        assert [use.used for use in made.report.frames] == [k < count for k in range(COUNT)]
+        assert {use.reason for use in made.report.frames if not use.used} == {NO_TIME}
+    assert (made.report.seconds["join"], made.report.rounds) == (0.0, bursts.single.stages[-1].most)
+
+
+def test_a_joined_frame_is_as_saturated_as_its_first(bursts: BurstReconstructor, frames: list) -> None:
+    bright = [frame.copy() for frame in frames]
+    for counts in bright:
+        counts[170:190, 230:250] = bursts.single.calibration.sensor.white_dn
+    made = picture(bursts, bright)
+    assert sum(use.used for use in made.report.frames) > 1
+    assert made.report.quality["saturated"] == picture(bursts, bright[:1]).report.quality["saturated"] > 0.001
+    assert any("too bright" in warning for warning in made.report.warnings)
 
 
 class TimeToJoinOnly(Deadline):
@@ -171,7 +182,7 @@ def test_a_deadline_after_the_joining_gives_one_frame_and_the_report_says_so(
     bursts: BurstReconstructor, frames: list
 ) -> None:
     made = picture(bursts, frames, TimeToJoinOnly(SystemClock(), 0.0))
-    assert [(use.used, use.reason) for use in made.report.frames] == [(True, None), *[(False, NO_TIME)] * 3]
+    assert [(use.used, use.reason) for use in made.report.frames] == [(True, None), *[(False, NOT_SOLVED)] * 3]
     assert made.report.stopped == "deadline"
 
 

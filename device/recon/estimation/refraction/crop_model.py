@@ -18,8 +18,10 @@ from scipy import ndimage
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction.edge import EdgeLikelihood
+from device.recon.estimation.refraction.field import Edge
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, RealFft, Spectrum
+from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import MIN_GOOD, Linear
 from device.values import Image
 
@@ -164,9 +166,7 @@ class CropModel:
         edge = self._edges.edge
         frequencies, levels = detail_levels(edges, eye_dpt)
         lit = np.pi * edge.radius_samples**2
-        seen = self.seen_share = float(np.prod(self._grid.window)) / (
-            np.pi * (edge.radius_samples + self._psf_samples) ** 2
-        )
+        seen = self.seen_share = seen_share(self._grid, edge, self._psf_samples)
         share = min(seen * float((edges.likelihood.taper**2).mean()), 1.0)
         logs = np.log(levels) - DETAIL_EXPONENT * np.log(frequencies / REFERENCE)
         self._root = (self._root_shape * np.exp(logs.mean() / 2) / np.sqrt(lit * share)).astype(np.float32)
@@ -249,6 +249,11 @@ class CropModel:
             fitted += np.float32(factor) * seen
             ratio = size / before
         return detail, self._weighting(frame - fitted), fitted
+
+
+def seen_share(grid: Grid, edge: Edge, psf_samples: float) -> float:
+    """Return the area of the window over that of the blurred field, for a PSF with this radius."""
+    return float(np.prod(grid.window)) / (np.pi * (edge.radius_samples + psf_samples) ** 2)
 
 
 def detail_levels(edges: EdgeLikelihood, eye_dpt: Floats) -> tuple[Floats, Floats]:

@@ -4,12 +4,12 @@ A cropped sensor shows only the inner part of the PSF of a point at the field ed
 another refraction: 0.1 deg of diameter cost 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. So the edge is not
 taken from the calibration. For each candidate eye T the likelihood of `estimator` is minimised over the edge e:
 
-    E(T) = min over d of  sum over f of  log S + |R_T - sum_k d_k R_T,k|^2 / S  +  |(e + d - e_calibrated) / PRIOR|^2
+    E(T) = min over d of  sum over f of  log S + |R_T - sum_k d_k R_T,k|^2 / S  +  |(e + d - e_expected) / PRIOR|^2
 
 R_T,k is the tapered spectrum of the derivative of smooth part times edge with respect to e_k (radius, centre, width),
-blurred by the candidate's PSF. PRIOR is sqrt(2) sd of the edge. The minimum over d is a generalised least-squares step
-with the spectrum S of detail and noise as covariance; the steps are repeated with the smooth part fitted within the
-edge found (NUMERICS.md 7.5).
+blurred by the candidate's PSF. e_expected is the calibrated edge, or the one of the picture (`lit_disc`); PRIOR is
+sqrt(2) sd of the edge. The minimum over d is a generalised least-squares step with the spectrum S of detail and noise
+as covariance; the steps are repeated with the smooth part fitted within the edge found (NUMERICS.md 7.5).
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from device.recon.estimation.background import SensorPolynomial, without
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import InterpolatedOtf, transform
-from device.recon.estimation.refraction.field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
+from device.recon.estimation.refraction.field import MARGIN_DEG, Edge, EdgePrior, FieldEdge, LitField
 from device.recon.estimation.refraction.likelihood import (
     Band,
     BandLikelihood,
@@ -35,7 +35,7 @@ from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.grid import Pair
 from device.recon.model.kernels import Pixels, Places
 from device.recon.model.preprocessing import Linear
-from device.values import Calibration, Geometry
+from device.values import Calibration, Geometry, Image
 
 SAMPLE_UM = 24.0
 PARAMETERS = 4
@@ -121,8 +121,13 @@ class EdgeLikelihood:
         background = self.likelihood.background
         self._uneven = None if background.polynomial(self._whole) is None else background.highest
         self._is_rounded = _is_rounded(counts)
-        self.edge = self.prior.calibrated
+        self.expect(self.prior.calibrated)
         return self.frame
+
+    def expect(self, edge: Edge) -> None:
+        """Begin again with this edge, and look for the frame's around it."""
+        self.prior = self.prior.around(edge)
+        self.edge = edge
 
     def set_noise(self, eye_dpt: Floats) -> None:
         """Set the noise from the sensor's gain, or from the residual of this candidate."""
@@ -141,6 +146,24 @@ class EdgeLikelihood:
         self._smooth = self.likelihood.smooth_part(self._sampled, smooth.image, otf, smooth.level_dn, smooth.stray_dn)
         self._moved_objects = [self.likelihood.object_spectrum(image) for image in smooth.derivatives]
         return smooth.level_dn
+
+    def picture(self, eye_dpt: Floats, power: Image) -> Image:
+        """Return the linear picture of the frame on the grid: smooth part of the last fit, and detail.
+
+        The detail is the Wiener estimate from the tapered rest of the frame; `power` is its spectrum, (rows, cols//2 +
+        1), in the units of the levels of the rings.
+        """
+        fft, grid, known = self.likelihood.model.fft, self.grid, self._sampled.known
+        stretch = transform(self.likelihood.geometry, *eye_dpt)
+        otf = self.likelihood.interpolated_otf.on_grid(grid.shape, grid.n, stretch)
+        np.multiply(self._smooth.spectrum, otf, out=fft.spectrum)
+        rest = self.frame.y - fft.inverse()[grid.slices] / np.float32(grid.size)
+        rest -= np.vdot(known, rest) / known.sum()
+        fft.space[:] = 0
+        fft.space[grid.slices] = rest * known
+        filtered = fft.forward() * otf.conj() * (power / (power * np.abs(otf) ** 2 + np.float32(self._noise_dn2)))
+        np.add(self._smooth.spectrum, filtered, out=fft.spectrum)
+        return np.asarray(fft.inverse() / np.float32(grid.size))
 
     def __call__(self, eye_dpt: Floats, most: int = PARAMETERS) -> Candidate:
         """Return the negative log likelihood of an eye, minimised over the first `most` parameters of the edge."""
@@ -181,7 +204,7 @@ class EdgeLikelihood:
     def _minimised(self, rest: Spectrum, otf: Spectrum, model: EdgeModel) -> Candidate:
         count = len(model.moved)
         penalty = self.prior.precision[:count]
-        away = (self.edge.vector - self.prior.calibrated.vector)[:count]
+        away = (self.edge.vector - self.prior.expected.vector)[:count]
         step = np.linalg.solve(model.matrix, (model.weighted @ rest).real - penalty * away).astype(np.float64)
         found = band_likelihood(rest - step.astype(np.float32) @ model.moved, otf, self.band, self._noise_dn2)
         candidate = _candidate(found)

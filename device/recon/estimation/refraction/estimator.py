@@ -24,10 +24,12 @@ from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.psf_warp import Wavefront, picture_otf, transform
 from device.recon.estimation.refraction.burst import LARGEST_STEP_DPT, MAX_SCATTER_DPT, MIN_FRAMES, FrameScatter
 from device.recon.estimation.refraction.crop import CropRefinement
+from device.recon.estimation.refraction.crop_model import seen_share
 from device.recon.estimation.refraction.cylinder import find_cylinder
 from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.likelihood import RefractionLikelihood
+from device.recon.estimation.refraction.lit_disc import seen_disc
 from device.recon.estimation.refraction.uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
@@ -44,9 +46,10 @@ MIN_NATS = 100.0  # median minus minimum of the coarse search
 MIN_FREQUENCIES = 500
 SD_PER_MISSING_DPT = 0.4  # times the missing share: saturated frames of 11 eyes were off by 1.4 sd (rms) without it
 ROUNDS = 3  # of smooth part, search and edge; a gap needs them, since its filling biases M towards the PSF of the fit
-MAX_ROUNDS = 8  # while the edge moves
+MAX_ROUNDS = 8  # while an edge moves that was looked for in the picture
 SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the rounds
-MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MAX_ROUNDS the edge was not found
+MOVING_SAMPLES = 0.6  # last change of an edge that was not found
+CROPPED_SD_DPT = 0.6  # a border through an optic disc: rms error of M and J0 of 14 frames, before the refinement
 CURVATURE_STEP_DPT = 0.25
 MAX_SD_DPT = 1.5
 MAX_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
@@ -85,7 +88,8 @@ class Refraction:
     The report has the opposite sign (correction at the pupil). `psf_scale` is the scale of the stored PSF; `curve`
     holds (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum
     over the coarse grid. `edge` is the edge of the lit field that was found with M.
-    `missing_sd_dpt` is the part of the sd from missing pixels. `cylinder` is None before `add_cylinder`, `scatter`
+    `missing_sd_dpt` is the part of the sd from missing pixels, `edge_sd_dpt` that from an edge that was not found near
+    its calibrated place. `cylinder` is None before `add_cylinder`, `scatter`
     before `join`.
     """
 
@@ -98,6 +102,7 @@ class Refraction:
     missing_sd_dpt: float
     cylinder: Cylinder | None = None
     scatter: FrameScatter | None = None
+    edge_sd_dpt: float = 0.0
 
     @property
     def in_doubt(self) -> bool:
@@ -168,6 +173,7 @@ class RefractionEstimator:
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
         self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
+        self._psf_samples = reach_px / self._edges.grid.n
         self._refinement = CropRefinement(self._edges, planner, reach_px)
         lever = bands.high / self._edges.grid.n * 2 * reach_px * geometry.scale_per_dpt
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
@@ -214,9 +220,7 @@ class RefractionEstimator:
         m_dpt = coarse.grid_search(self.step_dpt * COARSE_FRINGES / FRINGES)
         if coarse.depth_nats < MIN_NATS:
             return NoRefraction("the frame does not show the structure of this PSF")
-        m_dpt, moving_samples = self._alternate(m_dpt)
-        if moving_samples > MOVING_SAMPLES or edges.prior.is_at_end(edges.edge):
-            return NoRefraction("the edge of the lit field was not found near its calibrated place")
+        m_dpt, edge_sd_dpt = self._within_edge(m_dpt)
         if abs(m_dpt) >= SPAN_DPT:
             return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt")
         model = quadratic_model(edges, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
@@ -224,13 +228,14 @@ class RefractionEstimator:
             return NoRefraction("the likelihood has no clear minimum")
         missing_dpt = SD_PER_MISSING_DPT * frame.missing
         (m_dpt,) = model.minimum
-        (sd_dpt,) = np.hypot(model.sds(self._spread), missing_dpt)
+        (sd_dpt,) = np.hypot(model.sds(self._spread), np.hypot(missing_dpt, edge_sd_dpt))
         if sd_dpt > MAX_SD_DPT:
             return NoRefraction(f"the standard deviation would be {sd_dpt:.1f} dpt")
         edge = edges.field_edge(edges.edge_model(model.minimum))
         curve = tuple(sorted(coarse.known.items()))
+        scale = self.scale(float(m_dpt))
         return Refraction(
-            float(m_dpt), float(sd_dpt), self.scale(float(m_dpt)), coarse.depth_nats, curve, edge, missing_dpt
+            float(m_dpt), float(sd_dpt), scale, coarse.depth_nats, curve, edge, missing_dpt, edge_sd_dpt=edge_sd_dpt
         )
 
     def add_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
@@ -303,7 +308,7 @@ class RefractionEstimator:
         model = find_cylinder(self._edges, found.m_dpt, self._blocks)
         if model is None:
             return NoRefraction("the likelihood has no clear minimum with a cylinder")
-        sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
+        sds_dpt = np.hypot(np.hypot(model.sds(self._spread), found.edge_sd_dpt), (found.missing_sd_dpt, 0, 0))
         if sds_dpt.max() > MAX_SD_DPT:
             return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
         eye_dpt = model.minimum
@@ -329,23 +334,45 @@ class RefractionEstimator:
             cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
         )
 
-    def _alternate(self, m_dpt: float) -> tuple[float, float]:
-        """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on.
+    def _within_edge(self, m_dpt: float) -> tuple[float, float]:
+        """Return M with the field edge, from the M of the coarse search on, and what the edge adds to its sd in dpt.
+
+        An edge that is not found near its calibrated place is looked for in the picture. Then M is uncertain by its
+        change between both edges: that of the picture, and the one found from there on. On a cropped sensor it also is
+        by what such a border cuts.
+        """
+        edges = self._edges
+        found_dpt, moving_samples = self._alternate(m_dpt, ROUNDS)
+        if moving_samples < MOVING_SAMPLES and not edges.prior.is_at_end(edges.edge):
+            return found_dpt, 0.0
+        edges.expect(seen_disc(edges, np.array([m_dpt])) or edges.prior.calibrated)
+        edges.fit_smooth(np.array([m_dpt]))
+        seen_dpt = self._descend(m_dpt, self.step_dpt / 2)
+        found_dpt, _ = self._alternate(seen_dpt, MAX_ROUNDS)
+        by_crop_dpt = CROPPED_SD_DPT if seen_share(edges.grid, edges.edge, self._psf_samples) < 1 else 0.0
+        return found_dpt, float(np.hypot(found_dpt - seen_dpt, by_crop_dpt))
+
+    def _alternate(self, m_dpt: float, most: int) -> tuple[float, float]:
+        """Return M after at most `most` rounds of smooth part, search over M, and edge, from an M on.
 
         The second value is the last change of the edge in samples.
         """
         step_dpt = self.step_dpt / 2
-        for done in range(1, MAX_ROUNDS + 1):
+        for done in range(1, most + 1):
             self._edges.fit_smooth(np.array([m_dpt]))
-            fine = Search(self._near(m_dpt))
             before_dpt = m_dpt
-            (m_dpt, _) = fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)
+            m_dpt = self._descend(m_dpt, step_dpt)
             change_samples = self._edges.move_edge(self._edges(np.array([m_dpt])).step)
             step_dpt = self.step_dpt / 4
             is_settled = change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT
             if is_settled or (done >= ROUNDS and change_samples < MOVING_SAMPLES):
                 break
         return m_dpt, change_samples
+
+    def _descend(self, m_dpt: float, step_dpt: float) -> float:
+        """Return the M of the next minimum of the likelihood, with the linear model of the edge around `m_dpt`."""
+        fine = Search(self._near(m_dpt))
+        return fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)[0]
 
     def _near(self, m_dpt: float) -> Callable[[float], float]:
         """Return the likelihood of M with the linear model of the edge around `m_dpt`."""

@@ -4,6 +4,7 @@ The smooth part is the one of `shading`: Zernike polynomials, fitted to block me
 the edge is the calibrated one; here radius, centre and width of the edge may differ from one fit to the next.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,31 +83,39 @@ class FieldEdge:
 
 
 class EdgePrior:
-    """Calibrated edge with its uncertainty and range, for a field in degrees and a scale in samples per degree.
+    """Expected edge with its uncertainty and range, for a field in degrees and a scale in samples per degree.
 
-    `calibrated` is the first edge, `precision` half the inverse variance of each parameter around it, as in a negative
-    log likelihood, and `largest_samples` the largest radius.
+    `calibrated` is the edge of the calibration, `expected` the first edge of a frame (at first the same), `precision`
+    half the inverse variance of each parameter around it, as in a negative log likelihood, and `largest_samples` the
+    largest radius.
     """
 
     def __init__(self, field_deg: float, per_deg: float) -> None:
         self._per_deg = per_deg
         self._reach = MARGIN_DEG * per_deg
         self.calibrated = Edge(field_deg / 2 * per_deg, 0.0, 0.0, FIRST_WIDTH_DEG * per_deg)
+        self.expected = self.calibrated
         self.precision: Floats = (np.asarray(PRIOR_DEG) * per_deg) ** -2
         self.largest_samples = self.calibrated.radius_samples + self._reach
+
+    def around(self, edge: Edge) -> "EdgePrior":
+        """Return the prior with another expected edge."""
+        prior = copy(self)
+        prior.expected = edge
+        return prior
 
     def moved(self, edge: Edge, step: Floats) -> Edge:
         """Return an edge whose first parameters are moved by `step` (samples), within their range."""
         wanted = edge.vector
         largest = LARGEST_STEP_DEG * self._per_deg
         wanted[: step.size] += np.clip(step, -largest, largest)
-        middle = self.calibrated.vector[:3]
+        middle = self.expected.vector[:3]
         radius, down, right = np.clip(wanted[:3], middle - self._reach, middle + self._reach).tolist()
         return Edge(radius, down, right, float(np.clip(wanted[3], 1.0, 2 * self._reach)))
 
     def is_at_end(self, edge: Edge) -> bool:
         """Return True if radius or centre of the edge are at the end of their range."""
-        away = np.abs(edge.vector - self.calibrated.vector)[:3]
+        away = np.abs(edge.vector - self.expected.vector)[:3]
         return bool(away.max() > 0.99 * self._reach)
 
     def in_samples(self, edge: FieldEdge) -> Edge:
