@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -271,6 +271,9 @@ bench-attacks: .venv/ready ## Measure status and press while clients hold connec
 
 bench-budget: .venv/ready ## Press 60 times for each choice of the time budget: times from read-out and tap, rounds, colour.
 	@$(BIN)/python -m tests.bench.budgets
+
+bench-pi: .venv/ready ## Print the factor of this board over the reference: one planned FFT pair and one reconstruction.
+	@$(BIN)/python -m tests.bench.pi
 
 bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
 	@umockdev-wrapper $(BIN)/python -m tests.bench.kills

@@ -22,6 +22,7 @@ from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
 from device.values import Calibration, Image, Sensor
 from services.research.dataset_pairs import Dataset, Pair
+from services.research.fft_time import FftTime
 from services.research.frontier import Case, scored_region, selected_methods, this_machine, versions
 from services.research.frontier_result import Machine
 from services.research.pair_scores import PLANES, LeftOut, PairScore, PairScorer, Row, grey, left, rows
@@ -171,13 +172,13 @@ class _Run:
         """Reconstruct one pair with every method and the peer, and score the pictures."""
         calibration = calibration_of(pair, self.planner)
         judge: PairScorer | None = None
+        fft = FftTime.measured(self.planner, pair.shape, self.clock)
         for made in self._pictures(pair, calibration, progress):
             if pair.truth is not None and judge is None:
                 judge = self._judge(pair, calibration, made.picture)
             psnr_db, ssim, pcc = (None, None, None) if judge is None else judge(made.picture)
-            self.scores.append(
-                PairScore(pair.name, made.method, made.bin, made.rounds, made.seconds, psnr_db, ssim, pcc)
-            )
+            times = fft.times(made.seconds)
+            self.scores.append(PairScore(pair.name, made.method, made.bin, made.rounds, *times, psnr_db, ssim, pcc))
             accuracy = "" if psnr_db is None else f", {psnr_db:.2f} dB, PCC {pcc:.3f}"
             progress(f"  {made.method}: {made.seconds:.3f} s{accuracy}")
 

@@ -18,6 +18,7 @@ from device.recon.model.fft_plans import Planner
 from services.research.benchmark import calibration_of, case_of, selected, without_bad_pixels
 from services.research.dataset_pairs import Dataset, Entry, Pair
 from services.research.datasets import open_dataset
+from services.research.fft_time import FftTime
 from services.research.frontier import (
     Case,
     FrontierRequest,
@@ -116,16 +117,17 @@ def frontier_of_dataset(
         progress(f"{k} of {len(dataset)}: {entry.name}")
         try:
             measured = _Measured.of(dataset, entry, planner)
+            fft = FftTime.measured(planner, measured.pair.shape, SystemClock())
             found = measure_frontier(measured.case, request.plans, request.budget_s, request.repeats, progress, methods)
         except DiffuscopeError as error:
             left_out.append(left(entry.name, None, error, progress))
             continue
         frontiers.append(found)
-        scores += _scores(entry.name, found)
+        scores += _scores(entry.name, found, fft)
         left_out += found.left_out
         if peer is not None:
             try:
-                scores += measured.peer_scores(peer, found.region.shift_px, progress)
+                scores += measured.peer_scores(peer, found.region.shift_px, fft, progress)
             except DiffuscopeError as error:
                 left_out.append(left(entry.name, "LenslessPiCam", error, progress))
     if not frontiers:
@@ -170,23 +172,27 @@ class _Measured:
         return cls(pair, case_of(pair, calibration_of(pair, planner), dataset.layout.aligned))
 
     def peer_scores(
-        self, peer: LenslessPeer, shift: tuple[int, int], progress: ProgressCallback
+        self, peer: LenslessPeer, shift: tuple[int, int], fft: FftTime, progress: ProgressCallback
     ) -> Iterator[PairScore]:
         """Yield the scores of the peer in the region and at the shift of the methods."""
         judge = PairScorer(self.case.truth, scored_region(self.case)[0], shift)
         pictures = peer(without_bad_pixels(self.pair), self.case.calibration.psfs[0].pixels)
         for rounds, result in zip(peer.rounds, pictures, strict=True):
-            score = PairScore(self.pair.name, result.name, 1, rounds, result.seconds, *judge(result.picture))
+            times = fft.times(result.seconds)
+            score = PairScore(self.pair.name, result.name, 1, rounds, *times, *judge(result.picture))
             progress(f"  {result.name}: {result.seconds:.3f} s, {score.psnr_db:.2f} dB")
             yield score
 
 
-def _scores(pair: str, found: Frontier) -> list[PairScore]:
+def _scores(pair: str, found: Frontier, fft: FftTime) -> list[PairScore]:
     """Return the scores of every point of one pair, and of the instrument's choice."""
     own = found.choice
     return [
-        *(PairScore(pair, p.method, p.bin, p.rounds, p.seconds_median, p.psnr_db, p.ssim, p.pcc) for p in found.points),
-        PairScore(pair, CHOICE, 0, 0, own.solve_s, own.psnr_db, own.ssim, own.pcc),
+        *(
+            PairScore(pair, p.method, p.bin, p.rounds, *fft.times(p.seconds_median), p.psnr_db, p.ssim, p.pcc)
+            for p in found.points
+        ),
+        PairScore(pair, CHOICE, 0, 0, *fft.times(own.solve_s), own.psnr_db, own.ssim, own.pcc),
     ]
 
 

@@ -16,13 +16,19 @@ PLANES = "mean over the channels of a colour truth, each with its own fit"
 
 @dataclass(frozen=True)
 class PairScore:
-    """Time and scores of one picture; scores are None for a pair without a truth."""
+    """Time and scores of one picture; scores are None for a pair without a truth.
+
+    `fft_pairs` is the time over that of a planned FFT pair of the frame's grid in the same run, `pi5_seconds` the time
+    on a Raspberry Pi 5 by a stated factor: not measured.
+    """
 
     pair: str
     method: str
     bin: int
     rounds: int
     seconds: float
+    fft_pairs: float
+    pi5_seconds: float
     psnr_db: float | None
     ssim: float | None
     pcc: float | None
@@ -46,13 +52,15 @@ class Spread:
 
 @dataclass(frozen=True)
 class Row:
-    """One method over `pairs` pairs: median time in s, and scores. `bin` is 0 where it differs between pairs."""
+    """One method over `pairs` pairs: median times as of `PairScore`, and scores; `bin` is 0 where it differs."""
 
     method: str
     bin: int
     rounds: int
     pairs: int
     seconds_median: float
+    fft_pairs_median: float
+    pi5_seconds_median: float
     psnr_db: Spread | None
     ssim: Spread | None
     pcc: Spread | None
@@ -124,6 +132,8 @@ def rows(scores: Sequence[PairScore]) -> tuple[Row, ...]:
             *key,
             len(group),
             float(np.median([score.seconds for score in group])),
+            float(np.median([score.fft_pairs for score in group])),
+            float(np.median([score.pi5_seconds for score in group])),
             Spread.of([score.psnr_db for score in group]),
             Spread.of([score.ssim for score in group]),
             Spread.of([score.pcc for score in group]),
@@ -136,14 +146,17 @@ def table(found: Sequence[Row]) -> str:
     """Return rows as text, in the given order."""
     width = max([len(row.method) for row in found] + [len("method")])
     lines = [
-        f"{'method':<{width}} {'bin':>3} {'rounds':>6} {'pairs':>5} {'seconds':>8} {'PSNR dB':>14} "
+        f"{'method':<{width}} {'bin':>3} {'rounds':>6} {'pairs':>5} {'seconds':>8} {'FFT pairs':>9} {'Pi 5 s*':>8} "
+        f"{'PSNR dB':>14} "
         f"{'SSIM':>14} {'PCC':>14}"
     ]
     for row in found:
         lines.append(
             f"{row.method:<{width}} {row.bin or '-':>3} {row.rounds or '-':>6} {row.pairs:>5} "
-            f"{row.seconds_median:>8.3f} {_cell(row.psnr_db, 2):>14} {_cell(row.ssim, 3):>14} {_cell(row.pcc, 3):>14}"
+            f"{row.seconds_median:>8.3f} {row.fft_pairs_median:>9.1f} {row.pi5_seconds_median:>8.2f} "
+            f"{_cell(row.psnr_db, 2):>14} {_cell(row.ssim, 3):>14} {_cell(row.pcc, 3):>14}"
         )
+    lines.append("* by a stated factor, not measured")
     return "\n".join(lines)
 
 

@@ -111,7 +111,23 @@ def flicker(share: float) -> Build:
 
 def bands(share: float) -> Build:
     """Return the builder of a frame with bands of +- `share` (rolling shutter, LEDs dimmed by pulses at 400 Hz)."""
-    return lambda eye: eye.clean.with_raw(defects.bands(eye.clean.raw, eye.spec.camera, share))
+    return lambda eye: eye.frame(
+        {
+            "camera.exposure_s": defects.banded_exposure_s(share),
+            "sim.light.pwm_hz": defects.PWM_HZ,
+            "sim.sensor.line_s": defects.READ_S / eye.spec.camera.rows,
+        }
+    )
+
+
+def changed(**keys: float) -> Build:
+    """Return the builder of a frame with other values of the scene's flaws, `light__KEY` and `sensor__KEY`."""
+    return lambda eye: eye.frame({f"sim.{key.replace('__', '.')}": value for key, value in keys.items()})
+
+
+def columns(spread_e: float) -> Build:
+    """Return the builder of a frame whose columns of unmerged pixels have offsets of `spread_e` electrons."""
+    return lambda eye: eye.frame({"sim.sensor.column_noise_e": spread_e * eye.merged**1.5})
 
 
 def lines(of: Callable[[Counts, CameraSpec, float], Counts], share: float) -> Build:
@@ -291,6 +307,8 @@ CASES: tuple[Case, ...] = (
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
+    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step)) for step in (0.01, 0.03)),
+    _case("columns of 16 e-", "sensor", columns(16.0)),
     _case(
         "reflex, not clipped",
         "light",

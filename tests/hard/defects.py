@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 
 from device.config.head_file import CameraSpec
+from device.sim.effects.illumination import pulse_light
 from device.values import Counts, Image, Mask
 
 COLUMNS_AT = (0.31, 0.44, 0.56, 0.68)  # of the width
@@ -96,13 +97,9 @@ def flicker(counts: Counts, camera: CameraSpec, share: float) -> Counts:
 
 
 def bands(counts: Counts, camera: CameraSpec, share: float, phase: float = 0.3) -> Counts:
-    """Multiply the light above black by 1 +- `share`, a triangle of PWM_HZ over the rows; `phase` in periods.
-
-    So a rolling shutter sees LEDs that are dimmed by pulses of half a period, in an exposure of half a period more than
-    whole ones.
-    """
-    periods = PWM_HZ * READ_S * np.linspace(0, 1, counts.shape[0]) + phase
-    swing = 1 + share * (1 - 4 * np.abs(periods % 1 - 0.5))
+    """Multiply the light above black by that of pulses of PWM_HZ, about 1 +- `share`; `phase` in periods."""
+    begin_s = READ_S * np.linspace(0, 1, counts.shape[0]) + phase / PWM_HZ
+    swing = pulse_light(begin_s, banded_exposure_s(share), PWM_HZ, 0.5)
     return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
 
 
@@ -144,6 +141,11 @@ def lost_rows(counts: Counts, share: float) -> Counts:
     """Leave out `share` of the rows at 40 % of the height: those below move up, and the last ones become 0."""
     first, lost = round(0.4 * len(counts)), round(share * len(counts))
     return np.concatenate([counts[:first], counts[first + lost :], np.zeros_like(counts[:lost])])
+
+
+def banded_exposure_s(share: float) -> float:
+    """Return the exposure, half a period of PWM_HZ more than whole ones, whose bands are nearest to +- `share`."""
+    return (round(0.5 / share - 0.5) + 0.5) / PWM_HZ
 
 
 def reflex(counts: Counts, camera: CameraSpec) -> Counts:

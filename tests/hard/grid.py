@@ -14,8 +14,9 @@ from device.errors import SettingError
 from services.research.reconstruct_file import write_or_raise
 from tests.hard.cases import CASES, CLEAN, NAMED
 from tests.hard.cells import COLUMNS, DEFAULT_SCHEDULE, CaseRunner, Cell
+from tests.hard.figures import margins_table, recorded
 from tests.hard.frames import Eye
-from tests.hard.judgement import Violation, covered, violations
+from tests.hard.judgement import LOST, Violation, covered, ratio, violations
 from tests.hard.picture import draw_grid, explanations, table
 
 EYES = (
@@ -112,7 +113,7 @@ def write(folder: Path, found: HardCases) -> None:
     """Write `hard-cases.json`, `hard-cases.md` and a picture of each eye; StoreError if a file cannot be written."""
     write_or_raise(folder, lambda: folder.mkdir(parents=True, exist_ok=True))
     whole = {
-        "cells": [asdict(cell) | {"off_sd": cell.off_sd} for cell in found.cells],
+        "cells": [asdict(cell) | {"off_sd": cell.off_sd, "ratio": ratio(cell)} for cell in found.cells],
         "violations": [asdict(violation) for violation in found.violations],
     }
     pages = {"hard-cases.json": json.dumps(whole, indent=1) + "\n", "hard-cases.md": markdown(found)}
@@ -127,8 +128,15 @@ def markdown(found: HardCases) -> str:
     lines = [
         "# Hard cases",
         "",
-        "PCC inside the lit field, in brackets its change against the same method's clean frame.",
+        f"Loss of PCC inside the lit field against the same method's clean frame, over the allowed loss of {LOST}:",
+        "0 is the clean frame, 1 the limit; hard-cases.json has the PCC itself.",
         table(found.cells, found.columns),
+        "",
+        "## Errors over their bounds",
+        "",
+        "Where a bound is known (`python -m tests.hard.figures`): the worst case of each test, limit 1.",
+        "",
+        margins_table(recorded()),
         "",
         "## Explained losses",
         "",

@@ -89,9 +89,15 @@ def covered(cells: Sequence[Cell]) -> tuple[float, int]:
     return sum(sigmas <= COVERED_SIGMAS for sigmas in off) / max(len(off), 1), len(off)
 
 
+def ratio(cell: Cell) -> float | None:
+    """Return the loss of PCC over the allowed loss: 0 for the clean frame, 1 at the limit; None without a picture."""
+    return None if cell.lost is None else cell.lost / LOST
+
+
 def lost(cell: Cell) -> bool:
-    """Return whether `cell.lost` is above LOST or NaN; False without a picture."""
-    return cell.lost is not None and not cell.lost <= LOST
+    """Return whether the loss of PCC is above the allowed one or NaN; False without a picture."""
+    share = ratio(cell)
+    return share is not None and not share <= 1
 
 
 def explanation(cell: Cell, case: Case) -> str:

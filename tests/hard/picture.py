@@ -6,25 +6,25 @@ from html import escape
 from services.plot import document, rectangle, text
 from tests.hard.cases import CASES, NAMED
 from tests.hard.cells import Cell
-from tests.hard.judgement import Violation, explanation, lost
+from tests.hard.judgement import LOST, Violation, explanation, lost, ratio
 
 LEFT, TOP, WIDE, TALL, GAP, SKIP = 250, 150, 104, 24, 2, 10
-SHADES = (  # upper limit of the loss, colour, text colour
-    (0.01, "#1a7f5a", "#ffffff"),
-    (0.05, "#8fd0a8", "#10231a"),
-    (0.15, "#f3dc8c", "#33290a"),
-    (0.4, "#e89a5b", "#2e1706"),
+SHADES = (  # upper limit of the loss over the allowed one, colour, text colour
+    (0.2, "#1a7f5a", "#ffffff"),
+    (1, "#8fd0a8", "#10231a"),
+    (3, "#f3dc8c", "#33290a"),
+    (8, "#e89a5b", "#2e1706"),
     (float("inf"), "#b8403a", "#ffffff"),
 )
 REFUSED = "#8a8f98", "#ffffff"
 LEGEND = (
-    "PCC inside the lit field; in brackets its change against the same method's clean frame",
+    f"loss of PCC against the same method's clean frame, over the allowed loss of {LOST}: clean 0, limit 1",
     "m: a message is given   e: explained in hard-cases.md   red frame: must not be",
 )
 
 
 def draw_grid(cells: Sequence[Cell], broken: Sequence[Violation], eye: str, columns: Sequence[str]) -> str:
-    """Return the SVG of one eye's grid; colour: loss of PCC against the clean frame, red frame: violation."""
+    """Return the SVG of one eye's grid; colour: loss over the allowed one, red frame: violation."""
     mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
     bad = {(violation.case, violation.method) for violation in broken if violation.eye == eye}
     inner, y, group = [], TOP, ""
@@ -53,7 +53,7 @@ def _document(eye: str, columns: Sequence[str], inner: Sequence[str], y: int) ->
 
 
 def _scale() -> list[str]:
-    out, x, before = [text(20, 106, "PCC lost:", "small")], 90, 0.0
+    out, x, before = [text(20, 106, "loss:", "small")], 90, 0.0
     for limit, colour, ink in SHADES:
         words = f"< {limit:g}" if limit != float("inf") else f"> {before:g}"
         out += [_box(x, 92, 60, 20, colour), _label(x + 30, 106, words, ink)]
@@ -64,11 +64,12 @@ def _scale() -> list[str]:
 def _cell(cell: Cell, x: int, y: int, broken: bool) -> list[str]:
     colour, ink = REFUSED
     words, says = "crashed" if cell.crashed else "refused", cell.refused
-    if cell.pcc is not None and cell.lost is not None:
-        colour, ink = next((c, i) for limit, c, i in SHADES if not cell.lost >= limit)
+    share = ratio(cell)
+    if share is not None:
+        colour, ink = next((c, i) for limit, c, i in SHADES if not share >= limit)
         explained = lost(cell) and explanation(cell, NAMED[cell.case])
         marks = ("m" if cell.warnings else "") + ("e" if explained else "")
-        words = f"{cell.pcc:.2f} ({-cell.lost:+.2f}) {marks}".rstrip()
+        words = f"{share:.2f} {marks}".rstrip()
         says = " / ".join(cell.warnings)
     out = [
         f"<g><title>{escape(f'{cell.case}, {cell.method}: {says}')}</title>",
@@ -98,7 +99,7 @@ def _label(x: float, y: float, words: str, ink: str) -> str:
 
 
 def table(cells: Sequence[Cell], columns: Sequence[str]) -> str:
-    """Return one Markdown table per eye: cases by columns, refraction error, messages."""
+    """Return one Markdown table per eye: cases by columns, loss over the allowed one; messages."""
     lines: list[str] = []
     for eye in dict.fromkeys(cell.eye for cell in cells):
         mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
@@ -109,6 +110,10 @@ def table(cells: Sequence[Cell], columns: Sequence[str]) -> str:
             f"| case | {' | '.join(columns)} | refraction | messages |",
             "|---|" + "---|" * (len(columns) + 2),
         ]
+        above = [sum(lost(cell) for (_, method), cell in mine.items() if method == name) for name in columns]
+        lines.append(
+            f"| **above 1** | {' | '.join(f'{count} of {len(mine) // len(columns)}' for count in above)} | | |"
+        )
         for case in dict.fromkeys(cell.case for cell in cells if cell.eye == eye):
             row = mine[case, columns[0]]
             lines.append(
@@ -121,7 +126,8 @@ def table(cells: Sequence[Cell], columns: Sequence[str]) -> str:
 def _figures(cell: Cell) -> str:
     if cell.crashed:
         return "crashed"
-    return "refused" if cell.pcc is None or cell.lost is None else f"{cell.pcc:.3f} ({-cell.lost:+.3f})"
+    share = ratio(cell)
+    return "refused" if share is None else f"{share:.2f}"
 
 
 def explanations(cells: Sequence[Cell]) -> Mapping[str, str]:

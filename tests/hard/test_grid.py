@@ -15,7 +15,8 @@ from tests.hard.cases import CASES, CLEAN, NAMED
 from tests.hard.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
 from tests.hard.frames import Eye
 from tests.hard.grid import QUICK, QUICK_MERGED, run
-from tests.hard.judgement import KINDS, covered, kind, violations
+from tests.hard.judgement import KINDS, LOST, covered, kind, lost, ratio, violations
+from tests.hard.picture import draw_grid, table
 
 EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=QUICK_MERGED)
 
@@ -85,6 +86,19 @@ def test_a_refusal_and_a_reported_loss_are_no_violations() -> None:
     explained = replace(OTHER, lost=0.2, quality={})
     assert not violations([GOOD, refused, explained])
     assert covered([GOOD, refused, explained]) == (1.0, 2)
+
+
+def test_table_and_picture_hold_the_loss_over_the_allowed_one() -> None:
+    worse = replace(OTHER, pcc=0.85, lost=2 * LOST, warnings=("The frame is banded.",))
+    assert (ratio(GOOD), ratio(worse)) == (0, 2)
+    assert (lost(replace(OTHER, lost=LOST)), lost(worse)) == (False, True)
+    lines = table([GOOD, worse], (DEFAULT_SCHEDULE,)).splitlines()
+    assert [line.split("|")[1:3] for line in lines[-3:]] == [
+        [" **above 1** ", " 1 of 2 "],
+        [" clean ", " 0.00 "],
+        [" motion 0.5 deg ", " 2.00 "],
+    ]
+    assert "2.00 m" in draw_grid([GOOD, worse], [], "eye", (DEFAULT_SCHEDULE,))
 
 
 def test_every_case_has_known_kinds_of_warnings() -> None:
