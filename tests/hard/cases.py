@@ -308,7 +308,6 @@ CASES: tuple[Case, ...] = (
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
     *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step)) for step in (0.01, 0.03)),
-    _case("columns of 16 e-", "sensor", columns(16.0)),
     _case(
         "reflex, not clipped",
         "light",
@@ -316,21 +315,12 @@ CASES: tuple[Case, ...] = (
         "misfit",
         SPOTS,
     ),
-    _case(
-        "dust", "light", lambda eye: eye.clean.with_raw(defects.dust(eye.clean.raw, eye.spec.camera)), "spots", SPOTS
-    ),
-    _case(
-        "stray gradient 30 %",
-        "light",
-        lambda eye: eye.clean.with_raw(defects.gradient(eye.clean.raw, eye.spec.camera, 0.3)),
-        "eye bright misfit",
-        UNEVEN,
-    ),
+    _case("dust", "light", changed(sensor__dust_spots=14), "spots", SPOTS),
+    _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit", UNEVEN),
+    _case("column noise, 16 e-", "rows and columns", columns(16.0)),
     *(
         _case(f"{name}, {100 * share:g} %", "rows and columns", lines(of, share), true)
         for name, of, share, true in (
-            ("column noise", defects.column_noise, 0.013, "dim"),
-            ("column noise", defects.column_noise, 0.027, "dim"),
             ("row noise", defects.row_noise, 0.027, "dim misfit"),
             ("column gain", defects.column_gain, 0.01, "dim"),
         )

@@ -155,21 +155,6 @@ def reflex(counts: Counts, camera: CameraSpec) -> Counts:
     return _as_counts(counts + 0.6 * (counts.mean() - camera.black_dn) * disc, camera)
 
 
-def dust(counts: Counts, camera: CameraSpec) -> Counts:
-    """Take 35 % of the light from 14 discs of 2 % of the rows around the centre: dust on the sensor."""
-    rows, cols = counts.shape
-    places = np.random.default_rng(5).uniform(-0.3, 0.3, (14, 2)) * rows + np.array([rows, cols]) / 2
-    down, right = np.ogrid[:rows, :cols]
-    hidden = np.logical_or.reduce([np.hypot(down - at[0], right - at[1]) < 0.02 * rows for at in places])
-    return _as_counts(counts - 0.35 * hidden * (counts.astype(np.float64) - camera.black_dn), camera)
-
-
-def gradient(counts: Counts, camera: CameraSpec, share: float) -> Counts:
-    """Add stray light from 0 at the left to `share` of the mean light at the right edge."""
-    ramp = np.linspace(0, share, counts.shape[1]) * (counts.mean() - camera.black_dn)
-    return _as_counts(counts + ramp, camera)
-
-
 def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
     """Raise all counts by `more_dn`, so that the black level differs from the head file; round and clip."""
     return _as_counts(counts + more_dn, camera)
