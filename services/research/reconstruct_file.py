@@ -212,6 +212,8 @@ class FileReconstructor:
         of_psfs = () if psfs is None else (*psfs.notes, *psfs.damage)
         if loaded.is_encoded or (psfs is not None and psfs.damage):
             made = replace(made, report=without_psf_figures(made.report, "the counts of raw or PSF are damaged"))
+        elif field is not None and field.diameter_deg is None:
+            made = replace(made, report=without_psf_figures(made.report, "the light of the frame ends in no disc"))
         of_raw = (*loaded.notes, *head_notes(self._options, loaded))
         notes = (*of_field, *of_raw, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
         warnings = made.report.warnings

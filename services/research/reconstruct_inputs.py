@@ -182,7 +182,11 @@ def load_raw(
     if pattern is not None:
         planes = bayer.split(raw.pixels, pattern, raw.white_dn)
         raw = replace(raw, pixels=planes, bad=bayer.any_site(raw.bad))
-    return LoadedRaw(raw, name, (rows, cols), pattern, black_dn, is_simulated(source), (*encoded, *notes), gamma=gamma)
+    simulated = is_simulated(source)
+    notes = (*encoded, *notes)
+    return LoadedRaw(
+        raw, name, (rows, cols), pattern, black_dn, simulated, notes, gamma=gamma, is_encoded=bool(encoded)
+    )
 
 
 def linear(counts: NDArray[Any], full_dn: float, gamma: float) -> Image:
