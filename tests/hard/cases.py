@@ -41,6 +41,10 @@ BANDS = dict.fromkeys(
 SPOTS = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"), "A closed form has no residual, in which light that is no image would stand."
 )
+PATTERN = dict.fromkeys(
+    ("tikhonov", "gradient", "evidence"),
+    "A closed form takes gain and offset of each pixel as calibrated, not as seen.",
+)
 NO_TEST = dict.fromkeys(("tikhonov", "gradient"), "This closed form has no test of the PSF; the default has one.")
 PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
 HALF_LIGHT = {"all": "Half the electrons for the same counts: the shot noise is larger by the root of 2."}
@@ -253,8 +257,8 @@ CASES: tuple[Case, ...] = (
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
-    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step)) for step in (0.01, 0.03)),
-    _case("columns of 16 e-", "sensor", columns(16.0)),
+    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step), "", PATTERN) for step in (0.01, 0.03)),
+    _case("columns of 16 e-", "sensor", columns(16.0), "", PATTERN),
     _case(
         "reflex, not clipped",
         "light",
