@@ -48,6 +48,10 @@ UNEVEN = {
     "evidence": "A closed form has no residual, and on a sensor that the disc fills only its edge shows the gradient.",
     "tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure.",
 }
+PATTERN = dict.fromkeys(
+    ("tikhonov", "gradient", "evidence"),
+    "A closed form takes gain and offset of each pixel as calibrated, not as seen.",
+)
 NO_TEST = dict.fromkeys(("tikhonov", "gradient"), "This closed form has no test of the PSF; the default has one.")
 PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
 HALF_LIGHT = {"all": "Half the electrons for the same counts: the shot noise is larger by the root of 2."}
@@ -307,7 +311,7 @@ CASES: tuple[Case, ...] = (
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
-    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step)) for step in (0.01, 0.03)),
+    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step), "", PATTERN) for step in (0.01, 0.03)),
     _case(
         "reflex, not clipped",
         "light",
@@ -317,7 +321,7 @@ CASES: tuple[Case, ...] = (
     ),
     _case("dust", "light", changed(sensor__dust_spots=14), "spots", SPOTS),
     _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit", UNEVEN),
-    _case("column noise, 16 e-", "rows and columns", columns(16.0)),
+    _case("column noise, 16 e-", "rows and columns", columns(16.0), "", PATTERN),
     *(
         _case(f"{name}, {100 * share:g} %", "rows and columns", lines(of, share), true)
         for name, of, share, true in (
