@@ -84,6 +84,10 @@ QUALITY: Mapping[str, str] = {
     "structure_sure": "`structure_nats` in units of its standard error; below -3 the frame came through another PSF.",
     "flicker": "Rms of the gains of the rows, minus 1, that were taken out of the frame; absent without flicker.",
     "spots": "Share of the frame that no object explains (dust, reflexes) and that was left out; absent without any.",
+    "falloff": (
+        "Falloff of the light over the sensor, beside the flat frame's, that was evened out; absent without any."
+    ),
+    "leak": "Share of light that is no image, near a corner, that was taken out of the frame; absent without any.",
     "banding": (
         "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered. Of a closed "
         "form: rms of the periodic gain of the rows, absent without flicker."

@@ -38,7 +38,7 @@ BANDS = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"),
     "A closed form has no residual that would tell bands of the lamp from lines of the object: it only reports them.",
 )
-SPOTS = dict.fromkeys(
+NO_RESIDUAL = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"), "A closed form has no residual, in which light that is no image would stand."
 )
 NO_TEST = dict.fromkeys(("tikhonov", "gradient"), "This closed form has no test of the PSF; the default has one.")
@@ -242,7 +242,24 @@ CASES: tuple[Case, ...] = (
         "light",
         lambda eye: eye.clean.with_raw(defects.reflex(eye.clean.raw, eye.spec.camera)),
         "misfit",
-        SPOTS,
+        NO_RESIDUAL,
+    ),
+    *(
+        _case(
+            f"vignetting {share:.0%}",
+            "light",
+            lambda eye, share=share: eye.clean.with_raw(defects.vignetting(eye.clean.raw, eye.spec.camera, share)),
+            "falloff misfit",
+            NO_RESIDUAL,
+        )
+        for share in (0.2, 0.4)
+    ),
+    _case(
+        "stray corner",
+        "light",
+        lambda eye: eye.clean.with_raw(defects.leak(eye.clean.raw, eye.spec.camera, 0.5)),
+        "leak misfit",
+        NO_RESIDUAL,
     ),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),

@@ -35,6 +35,8 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),
     ("spots", ("dark spots",)),
+    ("falloff", ("falls off",)),
+    ("leak", ("leak of light",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
     ("counts", ("black level", "gain", "bits", "counts")),
