@@ -46,6 +46,7 @@ from device.recon.estimation.refraction.notation import report_of, scatter_of
 from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.estimation.sensor_lines import LineFinder
 from device.recon.estimation.spots import Spots, on_sensor
+from device.recon.estimation.uneven_light import FALLS, UnevenLight
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.compiled import read_only
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -496,7 +497,11 @@ class Reconstructor:
                 other = _Run(self, steady.counts, dark, run.deadline, rounds)
                 better = steadier(made, (yield from self._solve(other, asked, _Known())), steady.flicker)
                 made, run = (made, run) if better is made else (better, other)
+        light = None
+        if can_tell:
+            run, made, light = yield from _in_even_light(self, run, asked, made, solving_s)
         made = yield from _without_spots(self, run, asked, made, solving_s)
+        made = made if light is None else _with_light_reported(made, light)
         yield replace(made, report=replace(made.report, quality=made.report.quality | noise)) if noise else made
 
     def _solve(self, run: "_Run", asked: "_Asked", known: "_Known") -> Generator[Step, None, Reconstruction]:
@@ -737,6 +742,47 @@ def _reported_refraction(
     return corrected(eye, offset) if isinstance(eye, Refraction) else eye
 
 
+def _in_even_light(
+    owner: Reconstructor, run: "_Run", asked: "_Asked", made: Reconstruction, solving_s: float
+) -> Generator[Step, None, tuple["_Run", Reconstruction, UnevenLight | None]]:
+    """Yield the steps of the frame as in even light; return its run and picture if the forward model explains it much
+    better, else `run` and `made`; and the light that was taken out.
+
+    Each correction takes `solving_s`, and none begins after the deadline.
+    """
+    before, residual = _unevenness(run), made.report.residual
+    if before is None or residual is None:
+        return run, made, None
+    _, dark, _ = run.channel(0)
+    offset = owner.defects.dark if dark is None else np.asarray(dark, np.float32)
+    grid, white_dn = run.done.grid, owner.calibration.sensor.white_dn
+    for light in run.uneven:
+        if not run.fits(solving_s):
+            break
+        even = light.without(run.counts, offset, white_dn, grid)
+        other = _Run(owner, even, run.dark, run.deadline, run.most)
+        again = yield from owner._solve(other, asked, _Known())
+        after = _unevenness(other)
+        if after is None or again.report.residual is None:
+            continue
+        if after < FALLS * before and again.report.residual < residual:
+            known = {key: made.report.quality[key] for key in ("flicker",) if key in made.report.quality}
+            report = replace(again.report, quality=again.report.quality | known)
+            return other, replace(again, report=report), light
+    return run, made, None
+
+
+def _unevenness(run: "_Run") -> float | None:
+    return None if run.solved is None else run.solved.diagnostics.unevenness
+
+
+def _with_light_reported(made: Reconstruction, light: UnevenLight) -> Reconstruction:
+    """Return the picture with the size and the message of the light that was taken out in its report."""
+    report = made.report
+    quality = report.quality | {light.key: light.share}
+    return replace(made, report=replace(report, quality=quality, warnings=(*report.warnings, light.words)))
+
+
 def _without_spots(
     owner: Reconstructor, run: "_Run", asked: "_Asked", made: Reconstruction, solving_s: float
 ) -> Generator[Step, None, Reconstruction]:
@@ -871,6 +917,11 @@ class _Run:
     def spots(self) -> Spots | None:
         """Parts of a frame of one channel that its picture does not explain."""
         return None if self.solved is None or self.channels > 1 else self.solved.diagnostics.spots
+
+    @property
+    def uneven(self) -> Sequence[UnevenLight]:
+        """What may be uneven in the light of a frame of one channel, the most probable first."""
+        return () if self.solved is None or self.channels > 1 else self.solved.diagnostics.uneven
 
     def brightest(self) -> ChannelFrame:
         """Return counts, dark frame and defective pixels of the channel with the highest mean count."""

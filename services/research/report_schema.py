@@ -86,6 +86,10 @@ QUALITY: Mapping[str, str] = {
     "column_noise_dn": "Rms of the noise of the columns that was taken out of the frame, in DN; absent without it.",
     "row_noise_dn": "Rms of the noise of the rows that was taken out of the frame, in DN; absent without it.",
     "spots": "Share of the frame that no object explains (dust, reflexes) and that was left out; absent without any.",
+    "falloff": (
+        "Falloff of the light over the sensor, beside the flat frame's, that was evened out; absent without any."
+    ),
+    "leak": "Share of light that is no image, near a corner, that was taken out of the frame; absent without any.",
     "banding": (
         "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered. Of a closed "
         "form: rms of the periodic gain of the rows, absent without flicker."

@@ -40,7 +40,7 @@ BANDS = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"),
     "A closed form has no residual that would tell bands of the lamp from lines of the object: it only reports them.",
 )
-SPOTS = dict.fromkeys(
+NO_RESIDUAL = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"), "A closed form has no residual, in which light that is no image would stand."
 )
 UNEVEN = {
@@ -317,7 +317,24 @@ CASES: tuple[Case, ...] = (
         "light",
         lambda eye: eye.clean.with_raw(defects.reflex(eye.clean.raw, eye.spec.camera)),
         "misfit",
-        SPOTS,
+        NO_RESIDUAL,
+    ),
+    *(
+        _case(
+            f"vignetting {share:.0%}",
+            "light",
+            lambda eye, share=share: eye.clean.with_raw(defects.vignetting(eye.clean.raw, eye.spec.camera, share)),
+            "falloff misfit",
+            NO_RESIDUAL,
+        )
+        for share in (0.2, 0.4)
+    ),
+    _case(
+        "stray corner",
+        "light",
+        lambda eye: eye.clean.with_raw(defects.leak(eye.clean.raw, eye.spec.camera, 0.5)),
+        "leak misfit",
+        NO_RESIDUAL,
     ),
     _case("dust", "light", changed(sensor__dust_spots=14), "spots", SPOTS),
     _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit", UNEVEN),

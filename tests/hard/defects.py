@@ -155,6 +155,20 @@ def reflex(counts: Counts, camera: CameraSpec) -> Counts:
     return _as_counts(counts + 0.6 * (counts.mean() - camera.black_dn) * disc, camera)
 
 
+def vignetting(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Multiply the light above black by 1 - `share` r^2, with r from 0 at the middle to 1 at the corners."""
+    rows, cols = (np.arange(n) - (n - 1) / 2 for n in counts.shape)
+    squared = rows[:, None] ** 2 + cols**2
+    return _as_counts(camera.black_dn + (counts - camera.black_dn) * (1 - share * squared / squared.max()), camera)
+
+
+def leak(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Add `share` of the mean light in the bottom right corner, which falls off with a tenth of the sensor's width."""
+    rows, cols = (np.arange(n)[::-1] / counts.shape[1] for n in counts.shape)
+    added = share * np.exp(-np.hypot(rows[:, None], cols) / 0.1)
+    return _as_counts(counts + added * (counts.mean() - camera.black_dn), camera)
+
+
 def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
     """Raise all counts by `more_dn`, so that the black level differs from the head file; round and clip."""
     return _as_counts(counts + more_dn, camera)

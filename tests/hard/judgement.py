@@ -36,6 +36,8 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("psf", ("psf",)),
     ("misfit", ("does not explain",)),
     ("spots", ("dark spots", "spots on")),
+    ("falloff", ("falls off",)),
+    ("leak", ("leak of light",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
     ("counts", ("black level", "gain", "bits", "counts", "jpeg")),

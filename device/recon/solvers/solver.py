@@ -1,10 +1,11 @@
 """Interface of a solver, and the figures that it reports: all that a method of one's own has to provide."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from device.recon.estimation.spots import Spots
+from device.recon.estimation.uneven_light import UnevenLight
 from device.recon.model.preprocessing import Linear
 from device.values import Image
 
@@ -31,6 +32,10 @@ class Diagnostics:
         Figures of frame and picture.
     spots
         Parts of the frame that no object explains; None: none, or not searched for.
+    unevenness
+        Smooth part of the residual in units of its noise; None if it is unknown.
+    uneven
+        What may be uneven in the light of the frame, the most probable first; empty: nothing, or not searched for.
     """
 
     noise_dn: float | None = None
@@ -38,6 +43,8 @@ class Diagnostics:
     regularisation: Figures = field(default_factory=dict)
     quality: Figures = field(default_factory=dict)
     spots: Spots | None = None
+    unevenness: float | None = None
+    uneven: Sequence[UnevenLight] = ()
 
 
 class Solver(Protocol):

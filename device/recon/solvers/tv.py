@@ -21,6 +21,7 @@ from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.estimation.power_law_prior import Fit, PowerLaw, PowerLawPrior
 from device.recon.estimation.shading import Shading
 from device.recon.estimation.spots import find_spots
+from device.recon.estimation.uneven_light import MIN_UNEVENNESS, find_uneven_light, unevenness
 from device.recon.method_settings import Settings
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, RealFft
@@ -127,6 +128,8 @@ class EvidenceWiener:
             known,
             residual=known.residual if added.residual is None else added.residual,
             spots=known.spots if added.spots is None else added.spots,
+            unevenness=known.unevenness if added.unevenness is None else added.unevenness,
+            uneven=added.uneven or known.uneven,
             regularisation={**known.regularisation, **added.regularisation},
             quality={**known.quality, **added.quality},
         )
@@ -313,7 +316,8 @@ class TotalVariation(EvidenceWiener):
         """Write the picture to `out` (grid, float32), and its misfit to `diagnostics`.
 
         `residual` is the rms residual in units of the noise. With a known field the quality figures also
-        have `coverage` and the flicker figure `banding`, and `spots` are searched for if more than noise is left.
+        have `coverage` and the flicker figure `banding`, and `spots` and `uneven` light are searched for if more than
+        noise is left.
         """
         super().finish(out)
         noise = self.detail.noise
@@ -325,8 +329,14 @@ class TotalVariation(EvidenceWiener):
             light_dn = self.detail.mean_dn
             banding = quality_figures.banding(left, noise.variance_dn2(light_dn), light_dn)
             self._add_diagnostics(Diagnostics(quality={"banding": banding}))
+            seen = self.blurred[grid.slices]
+            uneven = unevenness(left, seen, noise)
+            self._add_diagnostics(Diagnostics(unevenness=uneven))
+            if uneven > MIN_UNEVENNESS:
+                frame = Linear(self._y + self.stray, self._good, light_dn, 0.0, 0.0)
+                self._add_diagnostics(Diagnostics(uneven=find_uneven_light(frame, self.shading.blurred)))
             if residual > MAX_NOISE:
-                variance_dn2 = noise.per_dn * np.maximum(self.blurred[grid.slices], 0) + noise.floor_dn2
+                variance_dn2 = noise.per_dn * np.maximum(seen, 0) + noise.floor_dn2
                 left /= np.sqrt(np.maximum(variance_dn2, 1e-9))
                 spots = find_spots(left, self._good > 0)
                 self._add_diagnostics(Diagnostics(spots=spots))
