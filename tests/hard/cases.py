@@ -336,7 +336,7 @@ CASES: tuple[Case, ...] = (
         "leak misfit",
         NO_RESIDUAL,
     ),
-    _case("dust", "light", changed(sensor__dust_spots=14), "spots", SPOTS),
+    _case("dust", "light", changed(sensor__dust_spots=14), "spots", NO_RESIDUAL),
     _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit", UNEVEN),
     _case("column noise, 16 e-", "rows and columns", columns(16.0), "", PATTERN),
     *(
