@@ -495,7 +495,8 @@ class Reconstructor:
             steady = self.flicker(counts, dark)
             if steady is not None:
                 other = _Run(self, steady.counts, dark, run.deadline, rounds)
-                better = steadier(made, (yield from self._solve(other, asked, _Known())), steady.flicker)
+                again = yield from _solved_again(self, other, asked)
+                better = made if again is None else steadier(made, again, steady.flicker)
                 made, run = (made, run) if better is made else (better, other)
         light = None
         if can_tell:
@@ -742,6 +743,17 @@ def _reported_refraction(
     return corrected(eye, offset) if isinstance(eye, Refraction) else eye
 
 
+def _solved_again(owner: Reconstructor, run: "_Run", asked: "_Asked") -> Generator[Step, None, Reconstruction | None]:
+    """Yield the steps of a corrected frame, and return its picture; None if too little of the frame is left.
+
+    The picture that was made of the whole frame then stays.
+    """
+    try:
+        return (yield from owner._solve(run, asked, _Known()))
+    except FrameError:
+        return None
+
+
 def _in_even_light(
     owner: Reconstructor, run: "_Run", asked: "_Asked", made: Reconstruction, solving_s: float
 ) -> Generator[Step, None, tuple["_Run", Reconstruction, UnevenLight | None]]:
@@ -761,9 +773,9 @@ def _in_even_light(
             break
         even = light.without(run.counts, offset, white_dn, grid)
         other = _Run(owner, even, run.dark, run.deadline, run.most)
-        again = yield from owner._solve(other, asked, _Known())
+        again = yield from _solved_again(owner, other, asked)
         after = _unevenness(other)
-        if after is None or again.report.residual is None:
+        if again is None or after is None or again.report.residual is None:
             continue
         if after < FALLS * before and again.report.residual < residual:
             known = {key: made.report.quality[key] for key in ("flicker",) if key in made.report.quality}
@@ -805,9 +817,8 @@ def _without_spots(
             break
         asked = replace(asked, joined=None if joined is None else np.where(hidden, np.float32(np.nan), joined))
         run = _Run(owner, np.where(hidden, np.float32(np.nan), counts), run.dark, run.deadline, run.most)
-        try:
-            again = yield from owner._solve(run, asked, _Known())
-        except FrameError:  # too little of the frame is left: the picture that was made stays
+        again = yield from _solved_again(owner, run, asked)
+        if again is None:
             break
         spots = run.spots
         if again.report.residual is not None and again.report.residual < (best.report.residual or 0.0):
