@@ -29,6 +29,7 @@ from device.recon.assessment.quality_figures import (
     light_over_noise,
     psf_match,
     quality_warnings,
+    states_misfit,
 )
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.flicker import FlickerFinder
@@ -688,6 +689,9 @@ class Reconstructor:
         if self._consistency is not None and not dark:
             figures = check.result() if check else self._consistency(run.counts, psf_scale, run.known_defects)
             match = _checked_match(figures, quality)
+        is_far = isinstance(run.refraction, NoRefraction) and run.refraction.is_far
+        if is_far and match in (Match.UNKNOWN, Match.FOREIGN) and not is_explained(quality, match, misfit):
+            match = Match.FOREIGN_OR_FAR
         noise_dn = None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin
         snr = light_over_noise(run.solved.frame.mean_dn, noise_dn, self.shape) if self.calibration.geometry else None
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience, snr)
@@ -777,7 +781,8 @@ def _in_even_light(
         after = _unevenness(other)
         if again is None or after is None or again.report.residual is None:
             continue
-        if after < FALLS * before and again.report.residual < residual:
+        is_better = after < FALLS * before and again.report.residual < residual
+        if is_better and not states_misfit(again.report.warnings):
             known = {key: made.report.quality[key] for key in ("flicker",) if key in made.report.quality}
             report = replace(again.report, quality=again.report.quality | known)
             return other, replace(again, report=report), light

@@ -27,6 +27,7 @@ from device.recon.assessment.quality_figures import (
     PSF_FIGURES,
     UNEXPLAINED,
     Audience,
+    states_misfit,
 )
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction.estimator import NoRefraction
@@ -406,7 +407,7 @@ def judged(report: FileReport, default: FileReport) -> FileReport:
             f"Spots on {share:.1%} of the frame are no part of the retina, and '{report.method}' does not leave them "
             "out: use the default method. Clean sensor and diffuser."
         )
-    unexplained = share or any(words in MISMATCHES.values() or words.startswith(UNEXPLAINED) for words in doubtful)
+    unexplained = share or states_misfit(doubtful)
     report = replace(report, warnings=tuple(dict.fromkeys((*warnings, *doubtful))))
     return without_psf_figures(report, "the forward model does not explain the frame") if unexplained else report
 
@@ -441,8 +442,7 @@ def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tup
             "is lit, give the head (--head), or use the method 'open'."
         )
     residual = report.residual or 0.0
-    is_stated = any(words in MISMATCHES.values() or words.startswith(UNEXPLAINED) for words in report.warnings)
-    if residual > MAX_RESIDUAL and not notes and not is_stated:
+    if residual > MAX_RESIDUAL and not notes and not states_misfit(report.warnings):
         found.append(
             f"The residual is {residual:.1f} times the noise, and about 1 where the picture explains the frame: parts "
             "of it may be false."

@@ -284,9 +284,13 @@ CASES: tuple[Case, ...] = (
         _case(f"eye off by {more_dpt:+g} dpt", "wrong PSF", of_eye(more_dpt), "", OTHER_EYE)
         for more_dpt in (0.5, -1, 2, -4)
     ),
+    *(
+        _case(f"eye off by {more_dpt:+g} dpt", "wrong PSF", of_eye(more_dpt), "far", OTHER_EYE)
+        for more_dpt in (15, -15)
+    ),
     _case("PSF off by 2 dpt", "wrong PSF", psf_of_eye(2.0), "", OTHER_EYE),
-    _case("PSF of another head", "wrong PSF", foreign_psf, "psf", NO_TEST),
-    _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf", NO_TEST),
+    _case("PSF of another head", "wrong PSF", foreign_psf, "psf far", NO_TEST),
+    _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf far", NO_TEST),
     _case("PSF of 30 e-", "wrong PSF", measured_psf(30), "psf misfit"),
     *(
         _case(f"PSF with {name}", "wrong PSF", measured_psf(15000, changed), "psf misfit")
@@ -337,10 +341,10 @@ CASES: tuple[Case, ...] = (
         NO_RESIDUAL,
     ),
     _case("dust", "light", changed(sensor__dust_spots=14), "spots", NO_RESIDUAL),
-    _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit", UNEVEN),
+    _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit leak", UNEVEN),
     _case("column noise, 16 e-", "rows and columns", columns(16.0), "", PATTERN),
     *(
-        _case(f"{name}, {100 * share:g} %", "rows and columns", lines(of, share), true)
+        _case(f"{name}, {100 * share:g} %", "rows and columns", lines(of, share), true, DIM)
         for name, of, share, true in (
             ("row noise", defects.row_noise, 0.027, "dim misfit"),
             ("column gain", defects.column_gain, 0.01, "dim"),

@@ -66,6 +66,7 @@ class Match(Enum):
     MIRRORED_LEFT_RIGHT = "mirrored left to right"
     MIRRORED_UP_DOWN = "mirrored up to down"
     FOREIGN = "does not match"
+    FOREIGN_OR_FAR = "does not match, or not with the refraction of an eye within 10 dpt"
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Quality figures of a picture without a reference image, and the messages that follow from them (NUMERICS.md 8.1)."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
 from math import prod
@@ -38,6 +39,8 @@ UNEXPLAINED = "The picture does not explain this frame: parts of it may be false
 # The words of these messages and of `quality_warnings` are sorted by KINDS in tests/hard/judgement.py.
 MISMATCHES = {
     Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
+    Match.FOREIGN_OR_FAR: "The refraction of this eye is beyond 10 dpt, which this head does not correct, or the PSF "
+    "is not that of this head.",
     Match.ROTATED: "The PSF is rotated by 180 degrees against this frame. Rotate the PSF by 180 degrees; run it again.",
     Match.MIRRORED_LEFT_RIGHT: "The PSF is mirrored left to right against this frame. Mirror the PSF; run it again.",
     Match.MIRRORED_UP_DOWN: "The PSF is mirrored top to bottom against this frame. Mirror the PSF; run it again.",
@@ -188,6 +191,11 @@ def psf_match(quality: dict[str, float | None]) -> Match:
 def light_over_noise(mean_dn: float, noise_dn: float | None, shape: tuple[int, int]) -> float | None:
     """Return the light of a whole frame of `shape` pixels over its noise; None if the noise of a pixel is unknown."""
     return float(mean_dn / noise_dn * prod(shape) ** 0.5) if noise_dn else None
+
+
+def states_misfit(warnings: Collection[str]) -> bool:
+    """Return whether the warnings of a report state that frame and PSF, or frame and picture, do not fit."""
+    return any(words in MISMATCHES.values() or words.startswith(UNEXPLAINED) for words in warnings)
 
 
 def quality_warnings(

@@ -38,7 +38,7 @@ from device.recon.model.grid import Pair, support_radius_px
 from device.recon.model.kernels import Pixels, Places
 from device.values import Calibration
 
-SPAN_DPT = 9.0
+SPAN_DPT = 10.5  # the eyes that are served, +-10 dpt, and the error of the first estimate
 FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of a search over M
 COARSE_FRINGES = 0.3  # the same of the coarse search with the edge
 COARSE_PARAMETERS = 1  # of the edge in the coarse search: the radius
@@ -127,9 +127,12 @@ class NoRefraction:
     ----------
     reason
         Reason, a sentence without a full stop.
+    is_far
+        True: the frame is explained best at the end of +-SPAN_DPT, by a far eye or another PSF.
     """
 
     reason: str
+    is_far: bool = False
 
 
 def can_estimate_refraction(calibration: Calibration) -> bool:
@@ -222,7 +225,7 @@ class RefractionEstimator:
             return NoRefraction("the frame does not show the structure of this PSF")
         m_dpt, edge_sd_dpt = self._within_edge(m_dpt)
         if abs(m_dpt) >= SPAN_DPT:
-            return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt")
+            return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt", is_far=True)
         model = quadratic_model(edges, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
         if not model.is_minimum:
             return NoRefraction("the likelihood has no clear minimum")
