@@ -685,13 +685,8 @@ class Reconstructor:
             quality |= _flicker_of_rows(self.flicker, run)
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
         psf_scale = self._psf_scale(run.eye)
-        match = psf_match(quality)
-        if self._consistency is not None and not dark:
-            figures = check.result() if check else self._consistency(run.counts, psf_scale, run.known_defects)
-            match = _checked_match(figures, quality)
-        is_far = isinstance(run.refraction, NoRefraction) and run.refraction.is_far
-        if is_far and match in (Match.UNKNOWN, Match.FOREIGN) and not is_explained(quality, match, misfit):
-            match = Match.FOREIGN_OR_FAR
+        match = psf_match(quality) if dark or self._consistency is None else _checked_match(self, run, quality, check)
+        match = _or_far(match, run.refraction, is_explained(quality, match, misfit))
         noise_dn = None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin
         snr = light_over_noise(run.solved.frame.mean_dn, noise_dn, self.shape) if self.calibration.geometry else None
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience, snr)
@@ -767,12 +762,12 @@ def _in_even_light(
     Each correction takes `solving_s`, and none begins after the deadline.
     """
     before, residual = _unevenness(run), made.report.residual
-    if before is None or residual is None:
+    if before is None or residual is None or run.diagnostics is None:
         return run, made, None
     _, dark, _ = run.channel(0)
     offset = owner.defects.dark if dark is None else np.asarray(dark, np.float32)
     grid, white_dn = run.done.grid, owner.calibration.sensor.white_dn
-    for light in run.uneven:
+    for light in run.diagnostics.uneven:
         if not run.fits(solving_s):
             break
         even = light.without(run.counts, offset, white_dn, grid)
@@ -790,7 +785,11 @@ def _in_even_light(
 
 
 def _unevenness(run: "_Run") -> float | None:
-    return None if run.solved is None else run.solved.diagnostics.unevenness
+    return None if run.diagnostics is None else run.diagnostics.unevenness
+
+
+def _spots(run: "_Run") -> Spots | None:
+    return None if run.diagnostics is None else run.diagnostics.spots
 
 
 def _with_light_reported(made: Reconstruction, light: UnevenLight) -> Reconstruction:
@@ -808,7 +807,7 @@ def _without_spots(
     The first residual shows the largest spots only, beside errors that they cause around them: each search is one of
     the frame without the spots found before. Every search takes `solving_s`, and none begins after the deadline.
     """
-    first = spots = run.spots
+    first = spots = _spots(run)
     if first is None:
         return made
     counts, joined, best, share = run.counts, asked.joined, made, 0.0
@@ -825,7 +824,7 @@ def _without_spots(
         again = yield from _solved_again(owner, run, asked)
         if again is None:
             break
-        spots = run.spots
+        spots = _spots(run)
         if again.report.residual is not None and again.report.residual < (best.report.residual or 0.0):
             best, share = again, float(hidden.mean())
     before, after = made.report.residual, best.report.residual
@@ -864,12 +863,20 @@ def steadier(made: Reconstruction, again: Reconstruction, flicker: float) -> Rec
     return replace(again, report=replace(report, seconds=seconds, quality=report.quality | {"flicker": flicker}))
 
 
-def _checked_match(figures: Consistency | None, quality: dict[str, float | None]) -> Match:
-    """Return whether frame and PSF match, and add the figures of the consistency check to `quality`."""
+def _checked_match(owner: Reconstructor, run: "_Run", quality: dict[str, float | None], check: Check | None) -> Match:
+    """Return whether frame and PSF match by the consistency test, and add its figures to `quality`."""
+    assert owner._consistency is not None
+    figures = check.result() if check else owner._consistency(run.counts, owner._psf_scale(run.eye), run.known_defects)
     if figures is None:
         return Match.UNKNOWN
     quality |= figures.report_figures
     return figures.match
+
+
+def _or_far(match: Match, refraction: Refraction | NoRefraction | None, explained: bool) -> Match:
+    """Return FOREIGN_OR_FAR for a frame that is not explained, and best at the end of the search for the refraction."""
+    is_far = isinstance(refraction, NoRefraction) and refraction.is_far
+    return Match.FOREIGN_OR_FAR if is_far and not explained and match in (Match.UNKNOWN, Match.FOREIGN) else match
 
 
 @dataclass(frozen=True)
@@ -930,14 +937,9 @@ class _Run:
         return self.cost_s(stage) + self.channels * (stage.reserved_s - stage.least_s)
 
     @property
-    def spots(self) -> Spots | None:
-        """Parts of a frame of one channel that its picture does not explain."""
-        return None if self.solved is None or self.channels > 1 else self.solved.diagnostics.spots
-
-    @property
-    def uneven(self) -> Sequence[UnevenLight]:
-        """What may be uneven in the light of a frame of one channel, the most probable first."""
-        return () if self.solved is None or self.channels > 1 else self.solved.diagnostics.uneven
+    def diagnostics(self) -> Diagnostics | None:
+        """Diagnostics of a frame of one channel, which tell what its picture does not explain."""
+        return None if self.solved is None or self.channels > 1 else self.solved.diagnostics
 
     def brightest(self) -> ChannelFrame:
         """Return counts, dark frame and defective pixels of the channel with the highest mean count."""

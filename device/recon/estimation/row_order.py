@@ -17,7 +17,7 @@ Series = NDArray[np.float64]
 
 MIN_LIKENESS = 0.6  # of the fine texture of two rows, over that of most: independent noise has up to 0.25
 MAX_TEXTURE = 0.3  # likeness of most rows: with more the frame is no raw one (scaled, or smooth)
-MIN_REPEATED = 0.004  # of the rows
+MIN_REPEATED, MIN_REPEATS = 0.004, 3  # of the rows, and rows: in short rows one is alike by chance
 MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
 MIN_VALUES = 16  # different values of a row: dark and saturated rows repeat by chance
 SEGMENTS = 8  # of a row, so that a spot, which lies in few, does not decide
@@ -48,7 +48,7 @@ class RowOrder:
         `bins`, `likeness` and `unknown` are those of its `Lines`, `bins` in DN above dark.
         """
         rows = np.flatnonzero(_repeated(counts, bins, likeness, unknown))
-        if rows.size >= max(1, MIN_REPEATED * len(bins)):
+        if rows.size >= max(MIN_REPEATS, MIN_REPEATED * len(bins)):
             raise FrameError(_words(rows), REMEDY)
         jumps = _jumps(bins, EVEN)
         places = np.flatnonzero((jumps > self._min_jumps).all(axis=0))
