@@ -22,6 +22,7 @@ MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
 MIN_VALUES = 16  # different values of a row: dark and saturated rows repeat by chance
 SEGMENTS = 8  # of a row, so that a spot, which lies in few, does not decide
 SEEN = 3  # of them must show a jump
+MIN_ROWS = 256  # with fewer three rows are as high as the structure of a PSF, which then jumps by itself
 SPANS = 135  # in the height of a frame: rows above and below, whose means are compared
 # Their difference over the largest one near by, of the counts and of the shares of a segment's light. Clean frames have
 # up to 1.3 and 1.3, reflexes and dust 1.6 and 1.5, bright frames without 24 of 1080 rows at least 3.2 and 2.6.
@@ -92,7 +93,7 @@ def _jumps(bins: Image, even: float) -> Series:
     not lit, or where one of those that are compared has less than `even` of the light of the brightest.
     """
     span = _span(len(bins))
-    if len(bins) < 8 * span or bins.shape[1] < SEGMENTS:
+    if len(bins) < MIN_ROWS or bins.shape[1] < SEGMENTS:
         return np.zeros((2, 0))
     light = bins.mean(axis=1)
     floor = MIN_LIGHT * max(float(light.max()), FAINT)

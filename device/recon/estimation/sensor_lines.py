@@ -114,7 +114,7 @@ class LineFinder:
         offset = self._dark if dark is None else np.asarray(dark, np.float32)
         dark_lines = self._dark_lines if dark is None else lines_of(dark)
         lines = lines_of(counts)
-        if (lines.likeness > SAME).mean() > MAX_REPEATED:  # a scaled file
+        if not lines.likeness.size or (lines.likeness > SAME).mean() > MAX_REPEATED:  # one row, or a scaled file
             return EvenFrame(counts, {})
         columns = line_noise(lines.bands - dark_lines.bands)
         rows = line_noise(_row_bands(lines.bins - dark_lines.bins))
