@@ -519,6 +519,7 @@ NO_PICTURES = {
     "services/imaging/picture_files.py to_jpeg": "resamples",
     "services/research/dataset_pairs.py _placed": "resamples",
     "tests/hard/cells.py files": "inputs of a command, deleted after it",
+    "tests/hard/defects.py jpeg": "blocks of a JPEG, decoded at once",
     "services/research/lensless_peer.py solve": "answer of a process of another solver",
     "tests/paper/pictures.py side_by_side": "resamples",
     "services/research/peers.py __call__": "input of a process of another solver",

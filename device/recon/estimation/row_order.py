@@ -17,12 +17,12 @@ Series = NDArray[np.float64]
 
 MIN_LIKENESS = 0.6  # of the fine texture of two rows, over that of most: independent noise has up to 0.25
 MAX_TEXTURE = 0.3  # likeness of most rows: with more the frame is no raw one (scaled, or smooth)
-MIN_REPEATED, MIN_REPEATS = 0.004, 3  # of the rows, and rows: in short rows one is alike by chance
+MIN_REPEATED = 0.004  # of the rows
 MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
 MIN_VALUES = 16  # different values of a row: dark and saturated rows repeat by chance
 SEGMENTS = 8  # of a row, so that a spot, which lies in few, does not decide
 SEEN = 3  # of them must show a jump
-MIN_ROWS = 256  # with fewer three rows are as high as the structure of a PSF, which then jumps by itself
+MIN_ROWS = 256  # of a sensor: in few and short rows texture is alike by chance, and a PSF as steep as a jump
 SPANS = 135  # in the height of a frame: rows above and below, whose means are compared
 # Their difference over the largest one near by, of the counts and of the shares of a segment's light. Clean frames have
 # up to 1.3 and 1.3, reflexes and dust 1.6 and 1.5, bright frames without 24 of 1080 rows at least 3.2 and 2.6.
@@ -44,12 +44,14 @@ class RowOrder:
         self._min_jumps = np.maximum(MIN_JUMPS, steepest)[:, None]
 
     def __call__(self, counts: Pixels, bins: Image, likeness: Image, unknown: Image) -> None:
-        """Raise FrameError if rows of a frame (rows, cols) are repeated or missing.
+        """Raise FrameError if rows of a frame (rows, cols) of at least MIN_ROWS are repeated or missing.
 
         `bins`, `likeness` and `unknown` are those of its `Lines`, `bins` in DN above dark.
         """
+        if len(bins) < MIN_ROWS:
+            return
         rows = np.flatnonzero(_repeated(counts, bins, likeness, unknown))
-        if rows.size >= max(MIN_REPEATS, MIN_REPEATED * len(bins)):
+        if rows.size >= MIN_REPEATED * len(bins):
             raise FrameError(_words(rows), REMEDY)
         jumps = _jumps(bins, EVEN)
         places = np.flatnonzero((jumps > self._min_jumps).all(axis=0))
@@ -93,7 +95,7 @@ def _jumps(bins: Image, even: float) -> Series:
     not lit, or where one of those that are compared has less than `even` of the light of the brightest.
     """
     span = _span(len(bins))
-    if len(bins) < MIN_ROWS or bins.shape[1] < SEGMENTS:
+    if len(bins) < 8 * span or bins.shape[1] < SEGMENTS:
         return np.zeros((2, 0))
     light = bins.mean(axis=1)
     floor = MIN_LIGHT * max(float(light.max()), FAINT)
