@@ -32,6 +32,7 @@ from device.recon.assessment.quality_figures import (
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction.estimator import NoRefraction
 from device.recon.estimation.refraction.notation import report_of
+from device.recon.estimation.row_order import ROWS_REMEDY
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
 from device.recon.methods import METHODS, Method
@@ -233,11 +234,10 @@ class FileReconstructor:
         pixels, own = without_unknown(loaded.raw.pixels, own)
         try:
             made = plan.solve(replace(loaded, raw=replace(loaded.raw, pixels=pixels)), own)
-        except FrameError as error:  # its remedy is for the operator of a head
-            raise FrameError(
-                f"{loaded.name}: {error.message}",
-                "Look for saturated or invalid pixels in the frame, its dark frame and its flat frame.",
-            ) from error
+        except FrameError as error:  # the other remedies are for the operator of a head
+            remedy = "Look for saturated or invalid pixels in the frame, its dark frame and its flat frame."
+            remedy = ROWS_REMEDY if error.remedy == ROWS_REMEDY else remedy
+            raise FrameError(f"{loaded.name}: {error.message}", remedy) from error
         if NO_SIGNAL in made.report.warnings:
             raise FrameError(
                 f"{loaded.name} holds no signal above the black level",

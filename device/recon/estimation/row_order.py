@@ -31,7 +31,7 @@ FAINT = 1e-9
 MIN_LIGHT = 0.2  # of the brightest row
 EVEN = 0.5  # of the brightest of the compared rows: with less it is dead, or the frame ends there
 MIN_SPREAD = 0.25  # of the rows that light of a point reaches: with less the object's own edges stay sharp
-REMEDY = "Take the frame again. If this returns, check the cable of the camera and its driver."
+ROWS_REMEDY = "Take the frame again. If this returns, check the cable of the camera and its driver."
 
 
 class RowOrder:
@@ -52,12 +52,12 @@ class RowOrder:
             return
         rows = np.flatnonzero(_repeated(counts, bins, likeness, unknown))
         if rows.size >= MIN_REPEATED * len(bins):
-            raise FrameError(_words(rows), REMEDY)
+            raise FrameError(_words(rows), ROWS_REMEDY)
         jumps = _jumps(bins, EVEN)
         places = np.flatnonzero((jumps > self._min_jumps).all(axis=0))
         if places.size:
             row = int(places[np.argmax(jumps[0, places])]) + _span(len(bins))
-            raise FrameError(f"rows are missing or at a wrong place from row {row} on", REMEDY)
+            raise FrameError(f"rows are missing or at a wrong place from row {row} on", ROWS_REMEDY)
 
 
 def _words(rows: np.ndarray) -> str:
