@@ -4,7 +4,8 @@ import numpy as np
 
 from device.clock import SystemClock, VirtualClock
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.values import Calibration, Geometry, Image, Psf, Sensor
 
 PLANNER = Planner(folder=None, threads=1, effort="FFTW_ESTIMATE")

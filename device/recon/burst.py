@@ -18,6 +18,7 @@ from device.clock import Clock
 from device.errors import FrameError
 from device.recon.estimation.group_registration import register_group
 from device.recon.estimation.registration import Registrar
+from device.recon.frames import plane
 from device.recon.model import kernels
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px, lit_field
@@ -25,14 +26,8 @@ from device.recon.model.grid import Grid
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Preprocessor
 from device.recon.model.resampling import add_moved_back, to_sensor
-from device.recon.reconstructor import (
-    ROUND_DONE,
-    QuickLook,
-    Reconstructor,
-    RoundDone,
-    default_schedule,
-    plane,
-)
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import ROUND_DONE, QuickLook, RoundDone, default_schedule
 from device.values import Calibration, FrameUse, Image, Mask
 
 SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading

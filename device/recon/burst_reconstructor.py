@@ -16,20 +16,14 @@ from device.clock import Deadline
 from device.errors import FrameError
 from device.recon.assessment.quality_figures import is_banded
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame, require_light
+from device.recon.corrections import is_steadier, with_corrections
 from device.recon.estimation.refraction.task import RefractionTask
+from device.recon.frame_run import EyePsf
+from device.recon.frames import checked, noise_frame
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import (
-    DurationEstimate,
-    EyePsf,
-    QuickLook,
-    Reconstructor,
-    RoundDone,
-    Step,
-    checked,
-    noise_frame,
-    steadier,
-)
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import DurationEstimate, QuickLook, RoundDone, Step
 from device.values import FrameUse, Reconstruction
 
 NO_TIME = "the time budget left no time to join it"
@@ -216,7 +210,10 @@ class BurstReconstructor:
                 looks = {first: self.single.quick_look(steady[first], dark)}
                 run = _Run(self, run.deadline, eye_psf)
                 again = yield from self._solve(run, steady, dark, unusable, {}, looks, simulated)
-                made = steadier(made, again, flicker)
+                is_better = is_steadier(made, again)
+                used, other = (again, made) if is_better else (made, again)
+                found = {"flicker": flicker} if is_better else {}
+                made = with_corrections(used, found, (), sum(other.report.seconds.values()))
         yield made
 
     def _first_look(
@@ -257,7 +254,7 @@ class BurstReconstructor:
         steady, flickers = list(frames), []
         for k, frame in enumerate(frames):
             usable = k not in unusable and frame.shape == self.single.shape
-            found = self.single.flicker(frame, dark) if usable else None
+            found = self.single.corrections.flicker(frame, dark) if usable else None
             if found is not None:
                 steady[k] = found.counts
                 flickers.append(found.flicker)

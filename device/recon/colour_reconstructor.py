@@ -17,10 +17,12 @@ from device.errors import FrameError
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour import ColourPicture, join_colours
 from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, picture_otf, transform
+from device.recon.frame_run import EyePsf
 from device.recon.model.field_of_view import field_box, field_radius_px, lit_field
 from device.recon.model.grid import Grid, disc
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import DurationEstimate, EyePsf, Reconstructor, RoundDone, Step
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import DurationEstimate, RoundDone, Step
 from device.recon.white_balance import balanced, white_ratios
 from device.values import ChannelUse, Colour, Geometry, Image, Reconstruction, Report
 

@@ -26,7 +26,8 @@ from device.errors import DiffuscopeError, SettingError
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.values import Calibration
 from services.errors import Busy, RecordNotFound
 from services.imaging import picture_files

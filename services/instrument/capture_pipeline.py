@@ -21,9 +21,11 @@ from device.recon.assessment.exposure_split import WHOLE, ExposureSplit, PressLi
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor, without_psf
 from device.recon.estimation.psf_selection import most_likely_psf
+from device.recon.frame_run import EyePsf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
-from device.recon.reconstructor import EyePsf, Reconstructor, Step, default_schedule
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Step, default_schedule
 from device.recon.white_balance import light_dn_per_s
 from device.values import (
     EYES,

@@ -17,7 +17,7 @@ from functools import partial
 from device.clock import Clock, Deadline
 from device.errors import DiffuscopeError, FrameError, LightFault, StoreError, StoreFull, StoreReadOnly
 from device.head import Head
-from device.recon.reconstructor import RoundDone, StageResult
+from device.recon.stage import RoundDone, StageResult
 from device.values import Reconstruction
 from services.errors import Busy, RequestRefused, StoreDamaged, StoreLocked
 from services.imaging.raw_metadata import RawMetadata

@@ -19,7 +19,8 @@ from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.methods import Method
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe, default_schedule
 from device.values import Calibration, Image, Sensor
 from services.research.dataset_pairs import Dataset, Pair
 from services.research.fft_time import FftTime

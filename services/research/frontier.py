@@ -26,7 +26,8 @@ from device.recon.model.fft_plans import Planner, processor_name
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe, default_schedule
 from device.sim.scene_files import simulate_exposure
 from device.values import Calibration, Image, Mask, Reconstruction
 from services.instrument.measured_frontier import MeasuredFrontier

@@ -19,10 +19,11 @@ from device.config.head_file import InstrumentSpec
 from device.head import hazard_of
 from device.recon.assessment.metrics import PictureScorer
 from device.recon.burst_reconstructor import BurstReconstructor
+from device.recon.frame_run import EyePsf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc
-from device.recon.reconstructor import EyePsf, Reconstructor
+from device.recon.reconstructor import Reconstructor
 from device.sim.render import crop_or_pad
 from device.sim.scene_files import lit_frames
 from device.sim.world import World

@@ -7,9 +7,9 @@ from device.errors import FrameError, SettingError
 from device.optics.lit_angle import has_sharp_edge, picture_field_deg
 from device.recon.assessment.lit_disc import lit_disc_deg
 from device.recon.assessment.quality_figures import LITTLE_LIGHT, MIN_EXPLAINED_LIT, UNEXPLAINED
+from device.recon.corrections import MAX_EXPLAINED
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import MAX_EXPLAINED
 from device.values import Calibration, Report
 from services.research.reconstruct_inputs import ReconstructOptions
 

@@ -33,6 +33,7 @@ from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction.estimator import NoRefraction
 from device.recon.estimation.refraction.notation import report_of
 from device.recon.estimation.row_order import ROWS_REMEDY
+from device.recon.frames import plane
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
 from device.recon.methods import METHODS, Method
@@ -40,8 +41,9 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box, field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import Recipe, Reconstructor, default_schedule, plane
+from device.recon.reconstructor import Reconstructor
 from device.recon.solvers.flat_field_correction import flat_field_correct
+from device.recon.stage import Recipe, default_schedule
 from device.values import Calibration, Image, Reconstruction, Report
 from services.imaging.colour_rendering import render_colour
 from services.imaging.picture_files import DISPLAY, to_png

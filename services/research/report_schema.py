@@ -26,6 +26,7 @@ SECONDS: Mapping[str, str] = {
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
     "cylinder": "Wait for the estimate of the cylinder: before the picture if it has no time budget, or after it.",
+    "correct": "Solutions of the same frame that were tried beside the picture: with its bands, uneven light or spots.",
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
 }
 REFRACTION: Mapping[str, str] = {

@@ -11,7 +11,8 @@ from device.recon.assessment.metrics import PictureScorer
 from device.recon.burst import BurstJoiner, JoinedFrame
 from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import disc
-from device.recon.reconstructor import Reconstructor, default_schedule
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import default_schedule
 from device.values import Calibration, Counts, Image, Mask, Reconstruction
 from tests.bench import timing
 from tests.bench.moving_eye import (

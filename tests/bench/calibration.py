@@ -10,7 +10,8 @@ from device.config.head_file import load_head
 from device.recon.assessment.metrics import PictureScorer
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.camera import SimCamera
 from device.sim.effects.sensor import hot_pixels
 from device.sim.light import SimLight

@@ -15,7 +15,8 @@ from device.recon.colour import join_colours, register_colours
 from device.recon.estimation.registration import Shift
 from device.recon.model.grid import disc
 from device.recon.model.resampling import moved_back
-from device.recon.reconstructor import Reconstructor, default_schedule
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import default_schedule
 from device.values import Colour, Image
 from tests.bench import timing
 from tests.bench.bursts import CLOCK, PLANNER, scored, scorer

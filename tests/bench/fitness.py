@@ -23,7 +23,8 @@ from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, Psf
 from device.recon.estimation.refraction.estimator import RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Counts

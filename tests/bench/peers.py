@@ -13,7 +13,8 @@ from device.recon.assessment.metrics import PictureScorer
 from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import Grid
 from device.recon.model.resampling import to_sensor
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.scene_files import SimulatedExposure
 from device.values import Image
 from tests.bench import timing

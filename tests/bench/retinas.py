@@ -16,7 +16,8 @@ from device.config.image_files import as_raw, read_image, read_psf
 from device.config.scene import EyeSpec, ObjectSpec
 from device.recon.assessment.metrics import PictureScorer, Scores
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.scene_files import SimulatedExposure, simulate_exposure
 from device.values import Calibration, Image, Reconstruction, Sensor
 from tests.bench import timing

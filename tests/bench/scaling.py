@@ -13,7 +13,8 @@ import numpy as np
 
 from device.clock import SystemClock
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.values import Calibration, Geometry, Psf, Sensor
 from services.plot import Mark, Plot, Series, log_axis, svg, time_axis
 from tests.bench import timing

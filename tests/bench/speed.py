@@ -5,8 +5,9 @@ from functools import partial
 
 from device.clock import SystemClock
 from device.recon.model.fft_plans import Planner, RealFft
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
 from device.recon.solvers.tv import TotalVariation
+from device.recon.stage import Recipe
 from device.sim.scene_files import SimulatedExposure
 from tests.bench import timing
 from tests.bench.peer_environment import peer

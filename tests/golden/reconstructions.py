@@ -11,7 +11,8 @@ from device.clock import VirtualClock
 from device.config.head_file import load_head
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Image, Reconstruction
 from tests.golden import compare

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
 from device.recon.solvers.wiener import TIKHONOV, ClosedForm
+from device.recon.stage import Recipe
 from device.values import Image, Psf, Sensor
 from tests import scenes
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from device.errors import FrameError, PsfError, SettingError
-from device.recon.reconstructor import Recipe
+from device.recon.stage import Recipe
 from device.values import Psf, Sensor
 from tests import scenes
 

@@ -7,7 +7,8 @@ import pytest
 
 from device.clock import VirtualClock
 from device.config.head_file import load_head
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration

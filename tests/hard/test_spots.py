@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from device.recon.reconstructor import MAX_EXPLAINED
+from device.recon.corrections import MAX_EXPLAINED
 from device.values import Image
 from tests.hard.exposed import exposed
 

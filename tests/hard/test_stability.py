@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from device.clock import VirtualClock
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.values import Image
 from tests import scenes
 from tests.hard.defects import blob

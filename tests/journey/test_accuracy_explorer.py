@@ -12,7 +12,7 @@ from PIL import Image
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import DiffuscopeError, SettingError
-from device.recon.reconstructor import Recipe
+from device.recon.stage import Recipe
 from device.sim.scene_files import simulate_exposure
 from services.errors import Busy, RecordNotFound
 from services.imaging.picture_files import raw_tiff

@@ -18,7 +18,8 @@ from device.config.head_file import InstrumentSpec, load_head
 from device.recon.assessment.metrics import pcc
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.resolution import working_bin
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.fundus import field_mask
 from device.sim.plan import ETA_THRESHOLD
 from device.sim.simulated_calibration import simulated_calibration

@@ -14,7 +14,8 @@ from device.config.image_files import as_raw, read_image, read_psf
 from device.recon.assessment.psf_consistency import Match, PsfConsistency
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe, default_schedule
 from device.values import Calibration, Image, Psf, Sensor
 from services.research.benchmark import BenchmarkRequest, benchmark
 from services.research.datasets import open_dataset

@@ -13,11 +13,13 @@ from device.optics.diffuser import Refraction as Wavefront
 from device.optics.diffuser import caustic
 from device.recon.estimation.psf_warp import transform, warped
 from device.recon.estimation.refraction.estimator import NoRefraction, Refraction, RefractionEstimator
+from device.recon.frame_run import EyePsf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import EyePsf, Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, Counts, Image, Psf, Reconstruction

@@ -36,7 +36,7 @@ from device.ports import Camera
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.laterality import Laterality
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import ROUND_DONE, Recipe, StageResult, Step
+from device.recon.stage import ROUND_DONE, Recipe, StageResult, Step
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration

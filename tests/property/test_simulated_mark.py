@@ -32,7 +32,7 @@ from device.config.head_file import load_head
 from device.config.marked_files import marked_pixels, stated_in, stated_mark, tiff_bytes, write_npy
 from device.light_safety.dose_report import DoseReport
 from device.ports import Camera
-from device.recon.reconstructor import Recipe
+from device.recon.stage import Recipe
 from device.sim.scene_files import simulate_exposure
 from device.values import Counts, ExposureSettings, Frame, Illumination, SimulatedCounts, Verdict
 from services.archive.plan import read_plan

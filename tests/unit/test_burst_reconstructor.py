@@ -9,7 +9,8 @@ from device.clock import Deadline, SystemClock
 from device.errors import FrameError
 from device.recon.burst_reconstructor import NO_TIME, NOT_SOLVED, BurstReconstructor
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Reconstructor, RoundDone, StageResult
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import RoundDone, StageResult
 from device.values import Image, Reconstruction
 from tests.moving_retina import (
     DRIFT_PX,

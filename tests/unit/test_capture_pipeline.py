@@ -18,7 +18,7 @@ from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.colour_reconstructor import without_psf
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import RoundDone, StageResult, Step
+from device.recon.stage import RoundDone, StageResult, Step
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration

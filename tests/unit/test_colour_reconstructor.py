@@ -11,7 +11,8 @@ from device.recon.colour import RGB
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
 from device.recon.estimation.psf_warp import Wavefront
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import Reconstructor, RoundDone, StageResult, Step
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import RoundDone, StageResult, Step
 from device.recon.white_balance import OVER_GREEN
 from device.values import ChannelUse, Colour, Image, Reconstruction
 from tests.moving_retina import RETINA, SHAPE, burst_calibration, field, frame, seen

@@ -12,8 +12,8 @@ from device.errors import FrameError
 from device.recon.burst import JoinedFrame, SeenFrame
 from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.model.preprocessing import Linear
-from device.recon.reconstructor import QuickLook, Recipe, Solved, StageResult
 from device.recon.solvers.solver import Diagnostics
+from device.recon.stage import QuickLook, Recipe, Solved, StageResult
 from device.values import Colour, Frame, Illumination, Image, Verdict
 from services.instrument.frame_preparation import FramePreparation
 from services.instrument.press_exposure import Exposure

@@ -20,9 +20,10 @@ from device.recon.methods import METHODS, Method
 from device.recon.model.fft_plans import Planner
 from device.recon.model.forward_model import Model
 from device.recon.model.preprocessing import Linear
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
 from device.recon.solver_contract import check_method
 from device.recon.solvers.solver import Solver
+from device.recon.stage import Recipe
 from device.sim.optical_setup import Scene
 from device.sim.plan import decide
 from device.sim.scene_files import simulate

@@ -11,7 +11,8 @@ from device.recon.estimation.shading import Shading
 from device.recon.model.forward_model import Model, otf
 from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import Linear
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.values import Geometry, Psf, Sensor
 from tests import scenes
 

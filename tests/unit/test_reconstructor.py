@@ -15,8 +15,9 @@ from device.config.head_file import load_head
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import Grid
-from device.recon.reconstructor import Recipe, Reconstructor, RoundDone, StageResult
+from device.recon.reconstructor import Reconstructor
 from device.recon.solvers.solver import Solver
+from device.recon.stage import Recipe, RoundDone, StageResult
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Image, Reconstruction
 from tests import scenes

@@ -23,7 +23,8 @@ from device.recon.estimation.refraction.correction import corrected
 from device.recon.estimation.refraction.estimator import Cylinder, Refraction
 from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.notation import report_of, sphere_cylinder
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Reconstructor
+from device.recon.stage import Recipe
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Psf, RefractionOffset, Sensor
 from services.instrument.trial_lens_measurement import LensBench, alignment_remedy, keep_offset

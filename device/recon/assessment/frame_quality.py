@@ -16,12 +16,12 @@ import numpy as np
 from device.errors import FrameError
 from device.recon.assessment.quality_figures import MAX_SATURATED, MIN_THROUGH
 from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.frames import plane
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.forward_model import Model, tight_model
 from device.recon.model.kernels import Pixels, Places
 from device.recon.model.preprocessing import Preprocessor
-from device.recon.reconstructor import plane
 from device.recon.solvers.tv import EvidenceWiener
 from device.values import Calibration, Image, Verdict
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from fastapi import APIRouter, Query
 
 from device.errors import CalibrationMissing
-from device.recon.reconstructor import Recipe
+from device.recon.stage import Recipe
 from device.values import Calibration
 from services.http.media import PngResponse, SvgResponse, file_responses
 from services.http.problem_responses import error_text

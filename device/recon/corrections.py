@@ -1,0 +1,232 @@
+"""Corrections of a frame that the forward model does not explain: flicker, uneven light, dust and reflexes.
+
+Each one changes the frame, solves it again, and is kept only if the forward model explains the changed frame better.
+None begins that would end after the deadline.
+"""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from device.errors import FrameError
+from device.recon.assessment.quality_figures import is_banded, states_misfit
+from device.recon.estimation.flicker import FlickerFinder
+from device.recon.estimation.spots import Spots, on_sensor
+from device.recon.estimation.uneven_light import FALLS
+from device.recon.frame_run import FrameRun
+from device.recon.stage import Step
+from device.values import Calibration, Image, Mask, Reconstruction
+
+SPOT_SEARCHES = 4
+MAX_HIDDEN = 0.15  # share of the sensor: with more the frame is another one
+BETTER = 0.9  # of the residual of the whole frame: by chance up to 0.97, dust at 500 electrons 0.78
+MAX_EXPLAINED = 1.2  # rms residual of a frame without its spots: 0.86 to 1.0
+DUST = (
+    "Dark spots, {share:.1%} of the frame, were left out; the largest is at row {row}, column {col} of the sensor. "
+    "Clean sensor and diffuser; if they stay, measure the flat frame again."
+)
+
+Solve = Callable[[FrameRun], Generator[Step, None, Reconstruction]]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Picture of a frame, and what was corrected in it.
+
+    Attributes
+    ----------
+    run
+        Run of the corrected frame.
+    made
+        Its picture, and its report without the corrections.
+    found
+        Size of each correction by its name in the report.
+    notes
+        Message of each correction that the reader of the report can do something about.
+    others_s
+        Duration of the solutions of the frame that are not used, in seconds.
+    """
+
+    run: FrameRun
+    made: Reconstruction
+    found: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    others_s: float = 0.0
+
+    def with_correction(self, name: str, size: float, *notes: str) -> "Solution":
+        """Return the solution with one more correction."""
+        return replace(self, found={**self.found, name: size}, notes=(*self.notes, *notes))
+
+    def choice(self, used: "Solution", tried: Sequence["Solution"]) -> "Solution":
+        """Return `used`, this solution or one of those that were tried after it, with the corrections of this one."""
+        others_s = self.others_s + sum(other.duration_s for other in (self, *tried) if other is not used)
+        return replace(used, found=self.found, notes=self.notes, others_s=others_s)
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the solution in seconds."""
+        return sum(self.made.report.seconds.values())
+
+    @property
+    def picture(self) -> Reconstruction:
+        """The picture with the corrections in its report."""
+        return with_corrections(self.made, self.found, self.notes, self.others_s)
+
+
+class Corrections:
+    """The corrections of the frames of one calibration and one sensor shape, tried one after the other.
+
+    Parameters
+    ----------
+    calibration
+        Calibration of the head.
+    shape
+        (rows, cols) of the sensor in pixels.
+    dark_dn
+        Dark frame of a frame without its own.
+    solve
+        Solver of a run: yields the steps before the picture, and returns the picture.
+    """
+
+    def __init__(self, calibration: Calibration, shape: tuple[int, int], dark_dn: Image, solve: Solve) -> None:
+        self.flicker = FlickerFinder(dark_dn, calibration.sensor.white_dn)
+        self._white_dn = calibration.sensor.white_dn
+        self._shape = shape
+        self._dark_dn = dark_dn
+        self._solve = solve
+
+    def __call__(self, run: FrameRun, made: Reconstruction) -> Generator[Step, None, Reconstruction]:
+        """Yield the steps of the corrected frames of a run, and return the best picture.
+
+        Parameters
+        ----------
+        run
+            Run of the whole frame.
+        made
+            Its picture.
+
+        Yields
+        ------
+        StageResult or RoundDone
+            The steps before a picture.
+        """
+        best = Solution(run, made)
+        if run.joined is None and not run.done.is_closed_form:
+            best = yield from self._without_flicker(best)
+            best = yield from self._in_even_light(best)
+        best = yield from self._without_spots(best)
+        return best.picture
+
+    def _again(self, run: FrameRun) -> Generator[Step, None, Solution | None]:
+        """Yield the steps of a corrected frame, and return its solution; None if too little of the frame is left."""
+        try:
+            made = yield from self._solve(run)
+        except FrameError:  # the picture of the whole frame stays, and its warnings say what the frame shows
+            return None
+        return Solution(run, made)
+
+    def _without_flicker(self, whole: Solution) -> Generator[Step, None, Solution]:
+        """Return the solution of the frame without flicker, if it shows any."""
+        run = whole.run
+        if not is_banded(whole.made.report.quality) or not run.fits(whole.duration_s):
+            return whole
+        steady = self.flicker(run.counts, run.asked.dark)
+        again = None if steady is None else (yield from self._again(run.again(steady.counts)))
+        if steady is None or again is None:
+            return whole
+        if not is_steadier(whole.made, again.made):
+            return whole.choice(whole, [again])
+        return whole.choice(again, [again]).with_correction("flicker", steady.flicker)
+
+    def _in_even_light(self, whole: Solution) -> Generator[Step, None, Solution]:
+        """Return the solution of the frame as in even light, if its residual falls much."""
+        run, before = whole.run, _unevenness(whole.run)
+        if before is None or run.diagnostics is None:
+            return whole
+        tried = []
+        _, dark, _ = run.channel(0)
+        offset = self._dark_dn if dark is None else np.asarray(dark, np.float32)
+        for light in run.diagnostics.uneven:
+            if not run.fits(whole.duration_s):
+                break
+            again = yield from self._again(run.again(light.without(run.counts, offset, self._white_dn, run.done.grid)))
+            if again is None:
+                continue
+            tried.append(again)
+            after = _unevenness(again.run)
+            is_even = after is not None and after < FALLS * before and _falls(whole, again)
+            if is_even and not states_misfit(again.made.report.warnings):
+                return whole.choice(again, tried).with_correction(light.key, light.share, light.words)
+        return whole.choice(whole, tried)
+
+    def _without_spots(self, whole: Solution) -> Generator[Step, None, Solution]:
+        """Return the solution of the frame without its spots, if the forward model explains it.
+
+        The first residual shows the largest spots only, beside errors that they cause around them: each search is one
+        of the frame without the spots found before.
+        """
+        first = spots = _spots(whole.run)
+        if first is None:
+            return whole
+        run, grid = whole.run, whole.run.done.grid  # a later solution may end after its quick look, on another grid
+        joined, best, share, tried = run.joined, whole, 0.0, []
+        hidden: Mask = np.zeros(self._shape, np.bool_)
+        for _ in range(SPOT_SEARCHES):
+            if spots is None or not run.fits(whole.duration_s):
+                break
+            hidden = hidden | on_sensor(spots.samples, grid)
+            if hidden.mean() > MAX_HIDDEN:
+                break
+            joined = None if joined is None else np.where(hidden, np.float32(np.nan), joined)
+            run = run.again(np.where(hidden, np.float32(np.nan), whole.run.counts), joined)
+            again = yield from self._again(run)
+            if again is None:
+                break
+            tried.append(again)
+            spots = _spots(run)
+            if _falls(best, again):
+                best, share = again, float(hidden.mean())
+        # with bands left something else is wrong with this frame
+        if not _falls(whole, best, BETTER, MAX_EXPLAINED) or is_banded(best.made.report.quality):
+            return whole.choice(whole, tried)
+        row, col = (at + n * grid.n for at, n in zip(grid.first_px, first.largest, strict=True))
+        notes = (DUST.format(share=share, row=row, col=col),) if first.are_dark else ()
+        return whole.choice(best, tried).with_correction("spots", share, *notes)
+
+
+def with_corrections(
+    made: Reconstruction, found: Mapping[str, float], notes: tuple[str, ...], others_s: float
+) -> Reconstruction:
+    """Return a picture with its corrections in the report, as in `Solution`."""
+    report = made.report
+    seconds = report.seconds | ({"correct": report.seconds.get("correct", 0.0) + others_s} if others_s else {})
+    quality, warnings = {**report.quality, **found}, (*report.warnings, *notes)
+    return replace(made, report=replace(report, seconds=seconds, quality=quality, warnings=warnings))
+
+
+def _unevenness(run: FrameRun) -> float | None:
+    return None if run.diagnostics is None else run.diagnostics.unevenness
+
+
+def _spots(run: FrameRun) -> Spots | None:
+    return None if run.diagnostics is None else run.diagnostics.spots
+
+
+def _falls(before: Solution, after: Solution, to: float = 1.0, most: float = float("inf")) -> bool:
+    """Return whether the residual falls below the share `to` of that before, and below `most`; False if unknown."""
+    whole, left = before.made.report.residual, after.made.report.residual
+    return whole is not None and left is not None and left < min(to * whole, most)
+
+
+def is_steadier(made: Reconstruction, again: Reconstruction) -> bool:
+    """Return whether the forward model explains frames without their flicker better.
+
+    A pattern of horizontal lines in the object looks like flicker, but the forward model explains it. A burst whose
+    frames did not match each other is explained better if more of them do.
+    """
+    before, after = made.report.residual, again.report.residual
+    if before is None or after is None:
+        return False
+    used = [sum(use.used for use in one.report.frames) for one in (made, again)]
+    return after < before or (used[1] > used[0] and not is_banded(again.report.quality))
