@@ -117,6 +117,16 @@ class FileReconstruction(Reconstruction):
         seconds = sum(report.seconds.values())
         return f"{report.method}, bin {report.bin}, solved on {rows} x {cols} by FFTW, {seconds:.3f} s"
 
+    @property
+    def refraction_words(self) -> str | None:
+        """Refraction in one line with what fixes its zero; None without one."""
+        refraction = self.report.refraction_dpt or {}
+        if refraction.get("sphere") is None:
+            return None
+        sphere, sd, zero = (refraction[key] for key in ("sphere", "sd", "zero"))
+        known = f"zero by the {zero}" if zero != "relative" else "relative to the PSF, whose zero is not known"
+        return f"refraction {sphere:+.2f} dpt (sd {sd:.2f}), {known}"
+
     def save(self, path: str | Path) -> None:
         """Write the picture, marked if it is simulated.
 
