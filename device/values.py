@@ -16,6 +16,7 @@ Mask = NDArray[np.bool_]
 
 Colour = Literal["red", "green", "blue", "amber"]
 Eye = Literal["OD", "OS"]
+RefractionZero = Literal["trial lens", "point source", "relative"]
 EYES: tuple[Eye, ...] = ("OD", "OS")
 
 
@@ -263,7 +264,8 @@ class Calibration:
     `psfs` has one entry or a stack over depth, for all colours or for each (`for_colour`); `dark_dn` (dark frame) and
     `flat` (flat frame) are (rows, cols) or None; `bad` marks defective pixels; `field_deg` is the diameter of the
     illuminated disc around the centre (None: not known); `refraction_offset` is None if no trial lenses were shown,
-    `white` if no white card was.
+    `white` if no white card was. `source_in_focus`: by its stated distance the point source stood in the focus of the
+    model eye, and no earlier calibration contradicts (`calibration/procedure/refraction_zero.py`).
     PsfError without PSFs or for PSFs of different shapes.
     """
 
@@ -277,6 +279,7 @@ class Calibration:
     simulated: bool = False
     refraction_offset: RefractionOffset | None = None
     white: WhiteReference | None = None
+    source_in_focus: bool = False
 
     def __post_init__(self) -> None:
         if not self.psfs:
@@ -296,6 +299,13 @@ class Calibration:
         return replace(self, psfs=own or every or self.psfs[:1])
 
     @property
+    def refraction_zero(self) -> RefractionZero:
+        """Origin of the zero of refractions: trial lenses, the point source, or "relative": nothing fixes it."""
+        if self.refraction_offset is not None:
+            return "trial lens"
+        return "point source" if self.source_in_focus else "relative"
+
+    @property
     def id(self) -> str:
         """Identity by content: the first sixteen hexadecimal digits of the SHA-256 of all values and arrays."""
         colours = tuple(psf.colour for psf in self.psfs)
@@ -305,6 +315,8 @@ class Calibration:
         for later in (self.refraction_offset, self.white):  # a calibration without them keeps its identity
             if later is not None:
                 digest.update(repr(later).encode())
+        if self.source_in_focus:
+            digest.update(b"source in focus")
         return digest.hexdigest()[:16]
 
 

@@ -250,6 +250,8 @@ def reconstruct(
     if report is not None:
         write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
     typer.echo(f"{output}: {made.summary}; {beat.spent}")
+    if made.refraction_words is not None:
+        typer.echo(made.refraction_words)
     for warning in made.report.warnings:
         typer.echo(f"note: {warning}", err=True)
 
@@ -440,6 +442,12 @@ def calibrate_head(
     eye_mm: Annotated[
         float | None, typer.Option(min=10, max=60, help="Focal length of the model eye's lens; 25 if nothing is given.")
     ] = None,
+    source_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=5, max=100, help="Distance of the source from that lens, as measured: the zero of refractions."
+        ),
+    ] = None,
     colours: Annotated[
         str, typer.Option(help="Also show the source in these, such as red,blue: a PSF of its own where they differ.")
     ] = "",
@@ -458,7 +466,7 @@ def calibrate_head(
     from services.workshop.calibrate_head import calibrate, measured_values
 
     mishaps = {stand: name for stand, _, name in (pair.partition("=") for pair in mishap or ())}
-    options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps
+    options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, source_mm, mishaps
     request = CalibrationRequest(archive, serial, by, *options)
     calibrated = calibrate(load_head(head), request, SystemClock(), _ask_operator, typer.echo)
     for line in (*measured_values(calibrated), f"{calibrated.calibration.id} is in force in {archive}"):

@@ -223,6 +223,7 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
         "geometry": asdict(calibration.geometry) if calibration.geometry else None,
         "refraction_offset": asdict(calibration.refraction_offset) if calibration.refraction_offset else None,
         "white": dict(calibration.white.dn_per_s) if calibration.white else None,
+        "source_in_focus": calibration.source_in_focus or None,
         "provenance": table,
         "figures": dict(provenance.figures),
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in arrays.items()},
@@ -264,6 +265,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
             simulated=_BOOL.validate_python(manifest["simulated"]),
             refraction_offset=_offset(manifest.get("refraction_offset")),
             white=_white(manifest.get("white")),
+            source_in_focus=_BOOL.validate_python(manifest.get("source_in_focus", False)),
             **{name: _checked_map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
         figures = tuple(manifest["figures"].items())

@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from device.clock import Clock
 from device.errors import FrameError
+from device.recon.estimation.black_parts import black_parts
 from device.recon.estimation.group_registration import register_group
 from device.recon.estimation.registration import Registrar
 from device.recon.frames import plane
@@ -127,9 +128,9 @@ class BurstJoiner:
 
         Yields ROUND_DONE after the picture of each frame that is not `ready` (by index, with the same dark frame), then
         the joined frame. `unusable` holds the reason of each frame that is known to be unusable, by index. A frame that
-        does not show what most of the others show, that is blurred by motion, that has no light or too many missing
-        pixels is left out, with its reason. With one frame left the result is that frame. FrameError if none can be
-        used.
+        does not show what most of the others show, that has a black part, that is blurred by motion, that has no light
+        or too many missing pixels is left out, with its reason. With one frame left the result is that frame.
+        FrameError if none can be used.
         """
         reasons = dict(unusable or {})
         seen = {k: seen_frame for k, seen_frame in (ready or {}).items() if k not in reasons}
@@ -141,7 +142,8 @@ class BurstJoiner:
             except FrameError as error:
                 reasons[k] = error.message
             yield ROUND_DONE
-        seen = {k: seen[k] for k in sorted(seen)}
+        reasons |= black_parts({k: (seen_frame.light_dn, seen_frame.good) for k, seen_frame in seen.items()})
+        seen = {k: seen[k] for k in sorted(seen) if k not in reasons}
         if not seen:
             raise FrameError(f"no frame of the burst can be used; the first: {reasons[0]}", "Take the burst again.")
         grid = self._stage.grid

@@ -478,7 +478,7 @@ class Reconstructor:
             psf_index=self.psf_index,
             psf_scale=psf_scale,
             psf_cylinder=self._psf_cylinder(run),
-            refraction_dpt=None if eye is None else report_of(eye),
+            refraction_dpt=None if eye is None else report_of(eye, self.calibration.refraction_zero),
             refraction_scatter=scatter_of(eye),
             regularisation=dict(diagnostics.regularisation),
             noise_dn=noise_dn,

@@ -40,6 +40,7 @@ def simulated_calibration(world: World) -> Calibration:
         bad=hot_pixels(world.scene) if world.scene.sim.sensor.hot_pixels else None,
         field_deg=picture_field_deg(world.spec),
         simulated=True,
+        source_in_focus=True,
     )
 
 

@@ -35,6 +35,7 @@ class CalibrationRequest:
     colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
     leds: Path | None = None
+    source_mm: float | None = None
     faults: Mapping[str, str] = field(default_factory=dict)  # injected fault by stand, simulated heads only
 
 
@@ -58,6 +59,7 @@ def calibration_job(
         request.colours,
         request.keep_raw,
         leds,
+        _source_mm(spec, request),
     )
 
 
@@ -95,6 +97,11 @@ def source_diameter_deg(spec: InstrumentSpec, request: CalibrationRequest) -> fl
     if request.source_deg is not None or spec.sim is None:
         return request.source_deg or 0.0
     return degrees(spec.sim.calibration.source_um / spec.sim.eye.focal_length_um)
+
+
+def _source_mm(spec: InstrumentSpec, request: CalibrationRequest) -> float | None:
+    """Return the stated distance of the point source, mm; a simulated one is in focus; None if it is unknown."""
+    return _eye_mm(spec, request) if request.source_mm is None and spec.sim is not None else request.source_mm
 
 
 def _eye_mm(spec: InstrumentSpec, request: CalibrationRequest) -> float:

@@ -204,7 +204,7 @@ class ShownReport(StoredRecord, DoseReport, Report):
     @field_validator("refraction_dpt", mode="before")
     @classmethod
     def _refraction(cls, value: object) -> object:
-        """Return the numbers and nulls of a refraction, and the text of `refused`; only `sphere` is checked."""
+        """Return the numbers and nulls of a refraction, its texts `zero` and `refused`; only `sphere` is checked."""
         if not isinstance(value, Mapping):
             return value
         if not _is_figure("sphere", value.get("sphere")):
@@ -241,7 +241,7 @@ class CaptureReport(ShownReport):
 
 def _is_figure(name: str, value: object) -> bool:
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return value is None or is_number or (name == "refused" and isinstance(value, str))
+    return value is None or is_number or (name in ("refused", "zero") and isinstance(value, str))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from services.research.reconstruct_inputs import ReconstructOptions
 
 TOLERANCE = 0.04  # of the given field: the disc is found within 0.012 of its diameter
 NEAR_HEAD = 0.03  # of the field of the head, which is then the one to give
+NO_DISC = "the light of the frame ends in no disc"
 MARGIN = 1.01  # of a disc that was found: the picture must not end within it
 
 
@@ -47,6 +48,11 @@ def is_doubtful(report: Report, options: ReconstructOptions) -> bool:
         return False
     is_odd = _is_refused(report) or (report.residual or 0.0) > MAX_EXPLAINED or not _is_all_lit(report)
     return options.field_deg is not None or is_odd
+
+
+def has_time_again(report: Report, options: ReconstructOptions) -> bool:
+    """Return whether the time budget leaves time to solve the frame once more, as long as the report says."""
+    return options.budget_s is None or 2 * sum(report.seconds.values()) < options.budget_s
 
 
 def _is_refused(report: Report) -> bool:

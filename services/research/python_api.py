@@ -76,6 +76,8 @@ class ReconstructionOptions(TypedDict, total=False):
         whatever a DNG says.
     refraction
         False leaves out the eye's refraction, which is estimated with `head`.
+    gamma
+        Exponent, 0.2 to 5, that makes the counts of raw, dark and flat frame linear in the light: 2.2 for sRGB.
     """
 
     dark: ImageSource
@@ -89,6 +91,7 @@ class ReconstructionOptions(TypedDict, total=False):
     budget_s: float
     bayer: str
     refraction: bool
+    gamma: float
 
 
 def reconstruct(
@@ -569,6 +572,7 @@ def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOpti
         settings=dict(given.get("settings", {})),
         bayer=parse_bayer(given.get("bayer")),
         refraction=given.get("refraction", True),
+        gamma=given.get("gamma"),
     )
 
 

@@ -27,12 +27,14 @@ from device.recon.white_balance import light_dn_per_s
 from device.values import Calibration, ChannelUse, Colour, FrameUse, Image, Psf, Reconstruction, Report
 from services.lru_cache import LruCache
 from services.research.burst_frames import common_raw, refuse_other_size, rejections, unusable_raws, without_bad
+from services.research.given_field import NO_DISC, LitField, has_time_again, is_doubtful, smaller_field
 from services.research.reconstruct_file import (
     FileReconstruction,
     FileReconstructor,
     doubts,
     file_report,
     plan_reconstructor,
+    without_psf_figures,
 )
 from services.research.reconstruct_inputs import (
     LoadedRaw,
@@ -184,12 +186,41 @@ class CaptureReconstructor:
         }
         _refuse_different(common, others)
         plan, notes, selected_s = self._plan(
-            common, {name: common_raw(given) for name, given in others.items()}, frames
+            common,
+            {name: common_raw(given) for name, given in others.items()},
+            frames,
+            self._options.field_deg,
         )
         return LoadedCapture(frames, lit, others, unusable, common, plan, notes, selected_s)
 
     def solve(self, loaded: LoadedCapture) -> CaptureReconstruction:
         """Return the picture of a loaded capture; FrameError for frames that cannot be solved."""
+        made = self._solved(loaded)
+        field = self._smaller_field(made.report, loaded)
+        has_time = has_time_again(made.report, self._options)
+        if field is not None and field.diameter_deg is not None and has_time:
+            others = {name: common_raw(given) for name, given in loaded.others.items()}
+            plan, *_ = self._plan(loaded.common, others, loaded.frames, field.diameter_deg)
+            loaded = replace(loaded, plan=plan)
+            made = self._solved(loaded)
+        solved = self._reported(made, loaded)
+        if field is None:
+            return solved
+        report = solved.made.report
+        report = replace(report, warnings=(*report.warnings, field.note(has_time)))
+        report = report if field.diameter_deg is not None else without_psf_figures(report, NO_DISC)
+        return replace(solved, made=replace(solved.made, report=report))
+
+    def _smaller_field(self, report: Report, loaded: LoadedCapture) -> LitField | None:
+        """Return the lit disc of the reference where it is smaller than the field; SettingError where it is larger."""
+        if not is_doubtful(report, self._options):
+            return None
+        reference = next(frame for frame, use in zip(loaded.lit, report.frames, strict=True) if use.used)
+        calibration = loaded.plan.single.calibration
+        return smaller_field(self._options, calibration, reference.raw.pixels, self._planner, report)
+
+    def _solved(self, loaded: LoadedCapture) -> Reconstruction:
+        """Return the picture of a loaded capture with the report of its solver."""
         frames = loaded.frames
         common = loaded.common
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
@@ -199,7 +230,7 @@ class CaptureReconstructor:
             for name, given in loaded.others.items()
         }
         dark = None if dark is None else np.nan_to_num(dark)
-        made = loaded.plan.solve(
+        return loaded.plan.solve(
             lit,
             loaded.unusable,
             dark,
@@ -208,47 +239,59 @@ class CaptureReconstructor:
             frames.full_drive_s,
             loaded.selected_s,
         )
-        return self._reported(made, loaded)
 
     def _plan(
-        self, common: LoadedRaw, others: Mapping[Colour, LoadedRaw], frames: CaptureFrames
+        self,
+        common: LoadedRaw,
+        others: Mapping[Colour, LoadedRaw],
+        frames: CaptureFrames,
+        field_deg: float | None,
     ) -> tuple["_CaptureSolvers", tuple[str, ...], float]:
         """Return the solvers for the levels of a capture, notes about the files of the PSFs, and seconds of the choice.
 
         `common` and `others` have the levels of all frames of a colour.
         """
-        whole, notes = self._calibration(self._options, common)
+        whole, notes = self._calibration(self._options, common, field_deg)
         reference = in_light(whole, frames.light, common.name)
         begin_s = self._clock.now_s()
         index = most_likely_psf(reference, common.raw.pixels, self._planner)[0] if len(reference.psfs) > 1 else 0
         selected_s = self._clock.now_s() - begin_s
         counts = tuple((name, len(given) > 1, _levels(others[name])) for name, given in sorted(frames.colours.items()))
-        key = common.solved_shape, _levels(common), len(frames.lit) > 1, frames.light, index, counts
+        key = field_deg, common.solved_shape, _levels(common), len(frames.lit) > 1, frames.light, index, counts
 
         def plan() -> _CaptureSolvers:
-            calibrations = {name: self._of_colour(name, raw, whole, reference) for name, raw in others.items()}
+            calibrations = {
+                name: self._of_colour(name, raw, whole, reference, field_deg) for name, raw in others.items()
+            }
             return _CaptureSolvers(self._options, reference, calibrations, frames, self._planner, index)
 
         return self._plans.get_or_make(key, plan), notes, selected_s
 
     def _of_colour(
-        self, name: Colour, loaded: LoadedRaw, whole: Calibration, reference: Calibration
+        self,
+        name: Colour,
+        loaded: LoadedRaw,
+        whole: Calibration,
+        reference: Calibration,
+        field_deg: float | None,
     ) -> Calibration | ChannelUse:
         """Return the calibration of another colour, `reference` if its PSF holds for any colour, or why none fits.
 
         It is that of the instrument: PSFs of that colour, else those that hold for any colour.
         """
         if name in self._of_colours:
-            return self._calibration(self._of_colours[name], loaded)[0]
+            return self._calibration(self._of_colours[name], loaded, field_deg)[0]
         measured = {psf.colour for psf in whole.psfs}
         if name in measured:
             return whole.for_colour(name)
         return reference if None in measured else without_psf(name)
 
-    def _calibration(self, options: ReconstructOptions, common: LoadedRaw) -> tuple[Calibration, tuple[str, ...]]:
-        """Return the calibration of the options for a raw, and notes about the files of the PSFs."""
+    def _calibration(
+        self, options: ReconstructOptions, common: LoadedRaw, field_deg: float | None
+    ) -> tuple[Calibration, tuple[str, ...]]:
+        """Return the calibration of the options for a raw with this field, and notes about the files of the PSFs."""
         psfs = None if options.calibration is not None else load_psfs(options, common, per_channel=False)
-        (calibration,) = load_calibrations(options, common, psfs)
+        (calibration,) = load_calibrations(replace(options, field_deg=field_deg), common, psfs)
         return calibration, () if psfs is None else (*psfs.notes, *psfs.damage)
 
     def _reported(self, made: Reconstruction, loaded: LoadedCapture) -> CaptureReconstruction:

@@ -49,7 +49,7 @@ from services.imaging.colour_rendering import render_colour
 from services.imaging.picture_files import DISPLAY, to_png
 from services.lru_cache import LruCache
 from services.research import sweep_plot
-from services.research.given_field import LitField, is_doubtful, smaller_field
+from services.research.given_field import NO_DISC, LitField, has_time_again, is_doubtful, smaller_field
 from services.research.reconstruct_inputs import (
     LoadedPsfs,
     LoadedRaw,
@@ -116,6 +116,16 @@ class FileReconstruction(Reconstruction):
         rows, cols = report.solved
         seconds = sum(report.seconds.values())
         return f"{report.method}, bin {report.bin}, solved on {rows} x {cols} by FFTW, {seconds:.3f} s"
+
+    @property
+    def refraction_words(self) -> str | None:
+        """Refraction in one line with what fixes its zero; None without one."""
+        refraction = self.report.refraction_dpt or {}
+        if refraction.get("sphere") is None:
+            return None
+        sphere, sd, zero = (refraction[key] for key in ("sphere", "sd", "zero"))
+        known = f"zero by the {zero}" if zero != "relative" else "relative to the PSF, whose zero is not known"
+        return f"refraction {sphere:+.2f} dpt (sd {sd:.2f}), {known}"
 
     def save(self, path: str | Path) -> None:
         """Write the picture, marked if it is simulated.
@@ -204,8 +214,7 @@ class FileReconstructor:
         plan = self._plan(loaded, psfs, self._options.field_deg)
         made = self._solved(plan, loaded, dark)
         field = plan.smaller_field(made.report, loaded)
-        budget_s = self._options.budget_s
-        has_time = budget_s is None or 2 * sum(made.report.seconds.values()) < budget_s
+        has_time = has_time_again(made.report, self._options)
         if field is not None and field.diameter_deg is not None and has_time:
             plan = self._plan(loaded, psfs, field.diameter_deg)
             made = self._solved(plan, loaded, dark)
@@ -217,7 +226,7 @@ class FileReconstructor:
         if loaded.is_encoded or (psfs is not None and psfs.damage):
             made = replace(made, report=without_psf_figures(made.report, "the counts of raw or PSF are damaged"))
         elif field is not None and field.diameter_deg is None:
-            made = replace(made, report=without_psf_figures(made.report, "the light of the frame ends in no disc"))
+            made = replace(made, report=without_psf_figures(made.report, NO_DISC))
         of_raw = (*loaded.notes, *head_notes(self._options, loaded))
         notes = (*of_field, *of_raw, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
         warnings = made.report.warnings

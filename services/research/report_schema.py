@@ -41,6 +41,10 @@ REFRACTION: Mapping[str, str] = {
     "axis_deg": "Axis of the cylinder in TABO degrees, above 0 and up to 180, as the examiner sees the eye.",
     "field_deg": "Diameter of the lit field that was found with the refraction, in degrees.",
     "field_deg_sd": "Standard deviation of `field_deg` in degrees; 0 for a field that was held.",
+    "zero": (
+        "Origin of the zero of `sphere`, `j0` and `j45`: `trial lens`, `point source` (its stated distance in the "
+        "calibration), or `relative`: nothing fixes it, and the numbers are those relative to the PSF."
+    ),
     "refused": "Reason for which there is no refraction, and every number is null; null with a refraction.",
 }
 PSF_CYLINDER: Mapping[str, str] = {
@@ -172,8 +176,8 @@ def _mapping(entry: Any) -> Any:
 
 
 def _named(key: str, text: str) -> dict[str, JsonValue]:
-    """Return the schema of a figure in an object: a number or null, but for the reason of a refusal a text or null."""
-    return {"type": ["string" if key == "refused" else "number", "null"], "description": text}
+    """Return the schema of a figure in an object: a number, for an origin and a refusal a text, or null."""
+    return {"type": ["string" if key in ("zero", "refused") else "number", "null"], "description": text}
 
 
 def schema_text() -> str:

@@ -16,6 +16,7 @@ from device.config.head_file import InstrumentSpec
 from device.errors import SettingError
 from device.head import Bench, open_bench
 from services.instrument.calibration_request import STEPS_FOLDER, CalibrationRequest, calibration_job, write_identity
+from services.workshop.calibration_words import ZERO_WORDS
 
 ASKED: dict[CalibrationTarget, str] = {
     "cap": "Put the cap on the head and shade it.",
@@ -52,13 +53,14 @@ def calibrate(
         return calibrate_on(bench, spec, request, clock, Operator(place, progress))
 
 
-def measured_values(kept: StoredCalibration) -> tuple[str, str]:
-    """Return two lines with the measured values of the sensor and the other figures of a calibration."""
+def measured_values(kept: StoredCalibration) -> tuple[str, ...]:
+    """Return lines with the measured values of the sensor, the other figures of a calibration, and its zero."""
     sensor = kept.calibration.sensor
     figures = ", ".join(f"{k} {v:.3g}" for k, v in kept.provenance.figures)
     return (
         f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN",
         f"read noise {sensor.read_noise_e:.2f} e-, {figures}",
+        f"zero of the refraction: {ZERO_WORDS[kept.calibration.refraction_zero]}",
     )
 
 

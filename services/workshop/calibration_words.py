@@ -1,7 +1,13 @@
 """Text of `diffuscope calibrations` for one archived calibration."""
 
 from device.calibration.archive import StoredCalibration
-from device.values import Calibration, Geometry, RefractionOffset, WhiteReference
+from device.values import Calibration, Geometry, RefractionOffset, RefractionZero, WhiteReference
+
+ZERO_WORDS: dict[RefractionZero, str] = {
+    "trial lens": "known by trial lenses",
+    "point source": "known by the stated distance of the point source",
+    "relative": "not known: refractions are relative to the PSF; show trial lenses, or calibrate with --source-mm",
+}
 
 
 def printable(text: str) -> str:
@@ -30,6 +36,7 @@ def details(kept: StoredCalibration) -> tuple[str, ...]:
         ("geometry", _geometry(found.geometry)),
         ("field", "unknown" if found.field_deg is None else f"{found.field_deg:g} deg"),
         *((name, "unknown" if getattr(found, name) is None else "measured") for name in ("dark_dn", "flat", "bad")),
+        ("zero of the refraction", ZERO_WORDS[found.refraction_zero]),
         ("trial lenses", _offset(found.refraction_offset)),
         ("white card", _white(found.white)),
         *((f"psf {k}", printable(psf.name)) for k, psf in enumerate(found.psfs)),

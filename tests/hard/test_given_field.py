@@ -6,8 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from device.clock import VirtualClock
 from device.errors import SettingError
 from device.recon.assessment.lit_disc import disc_radius
+from device.sim.scene_files import lit_frames
+from device.sim.world import World
+from services.research.reconstruct_capture import CaptureFrames, CaptureReconstructor
 from services.research.reconstruct_file import FileReconstruction, FileReconstructor
 from tests.hard.cells import CaseRunner
 from tests.hard.frames import Eye, HardFrame, crescent_dark
@@ -39,6 +43,25 @@ def test_a_field_beyond_the_lit_disc_gives_the_picture_of_the_disc_and_says_so(t
     expected = reconstructed(EYE.clean, tmp_path, None)
     assert not expected.report.warnings
     np.testing.assert_array_equal(made.picture, expected.picture)
+
+
+@pytest.mark.parametrize("field_deg", [28.0, 40.0])
+def test_the_field_of_a_burst_and_of_colours_is_compared_too(field_deg: float, tmp_path: Path) -> None:
+    _, whole, _ = CaseRunner(EYE, tmp_path, ()).files(EYE.clean, "variation")
+    options = replace(whole, field_deg=field_deg)
+    first, second = lit_frames(World(EYE.spec, VirtualClock()), 2)
+    burst, colours = CaptureFrames((first, second)), CaptureFrames((first,), {"red": (second,)}, light="green")
+    for frames in (burst, colours):
+        reconstruct = CaptureReconstructor(options, of_colours={"red": options})
+        if field_deg < FIELD_DEG:
+            with pytest.raises(SettingError, match=r"a disc of 33.4 degrees.*given as 28"):
+                reconstruct(frames)
+        else:
+            solved, expected = reconstruct(frames), CaptureReconstructor(whole, of_colours={"red": whole})(frames)
+            assert any("--field-deg 33.4" in warning for warning in solved.made.report.warnings)
+            np.testing.assert_allclose(
+                solved.made.picture, expected.made.picture, atol=1e-3 * solved.made.picture.max()
+            )
 
 
 @pytest.mark.parametrize("m_dpt", [-4.0, 3.0])

@@ -149,6 +149,18 @@ def test_a_closed_form_without_a_field_warns(scene: diffuscope.SimulatedScene) -
     assert with_field.report.refraction_dpt is None
 
 
+def test_counts_with_a_gamma_are_made_linear(scene: diffuscope.SimulatedScene) -> None:
+    """The gamma is that of the file, black level included: the picture of the linear counts comes back."""
+    top = float(scene.raw.max())
+    encoded = np.rint(65535 * (np.asarray(scene.raw) / top) ** (1 / 2.2)).astype(np.uint16)
+    linear = diffuscope.reconstruct(np.asarray(scene.raw), scene.psf, method="gradient")
+    made = diffuscope.reconstruct(encoded, scene.psf, method="gradient", gamma=2.2)
+    assert made.report.given["gamma"] == 2.2
+    assert np.corrcoef(made.picture.ravel(), linear.picture.ravel())[0, 1] > 0.99
+    with pytest.raises(diffuscope.SettingError, match="a gamma of 9"):
+        diffuscope.reconstruct(encoded, scene.psf, gamma=9.0)
+
+
 def test_a_residual_that_noise_does_not_explain_is_said(scene: diffuscope.SimulatedScene) -> None:
     """Light that the PSF does not explain, a bright square, is left over."""
     spoilt = scene.raw.copy()

@@ -71,7 +71,7 @@ FIGURES = (
     "field_deg",
     "field_deg_sd",
 )
-CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
+CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"zero": "point source", "refused": None}}
 WARPED = {
     "psf_cylinder": {"j0_dpt": -1.0, "j45_dpt": 0.25, "gain_db": None},
     "refraction_scatter": {"frames": 4, "sd_dpt": 0.05, "stated_sd_dpt": 0.04, "chi2": 4.6875},

@@ -1,5 +1,6 @@
 """Bursts: shifts, rejected frames and gain of joined frames of a moving retina behind a field that stands still."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,18 @@ from device.recon.model.grid import Grid, disc
 from device.recon.model.resampling import moved_back
 from device.recon.reconstructor import Reconstructor
 from device.values import Calibration, Counts, Image, Reconstruction
-from tests.moving_retina import DRIFT_PX, FIELD_PX, OTHER_RETINA, RETINA, SHAPE, burst_calibration, field, frame, seen
+from tests.moving_retina import (
+    BLACK_DN,
+    DRIFT_PX,
+    FIELD_PX,
+    OTHER_RETINA,
+    RETINA,
+    SHAPE,
+    burst_calibration,
+    field,
+    frame,
+    seen,
+)
 
 PLANNER = Planner(folder=None, effort="FFTW_ESTIMATE")
 
@@ -83,7 +95,7 @@ def test_a_frame_that_is_blurred_by_motion_is_left_out_and_costs_nothing(join: B
     saccade = np.mean([seen(RETINA, (down, right)) for down, right in places], axis=0, dtype=np.float32)
     joined, alone = join([*good[:2], frame(saccade, 5000, 7), good[2]]), join(good)
     assert [use.used for use in joined.frames] == [True, True, False, True]
-    assert "blurred by motion" in (joined.frames[2].reason or "")
+    assert "moved during its exposure" in (joined.frames[2].reason or "")
     assert np.nanmax(np.abs(joined.counts - alone.counts)) < 0.02 * np.nanmax(alone.counts)  # shifts within 0.01 pixels
 
 
@@ -93,7 +105,39 @@ def test_a_frame_that_is_blurred_by_motion_is_left_out_and_costs_nothing(join: B
 def test_noise_is_not_taken_for_motion_blur(join: BurstJoiner, peaks_e: tuple[float, ...]) -> None:
     """A frame of less light than the others, or noise in the others, correlates less, and keeps its place."""
     frames = [frame(seen(RETINA, moved), peaks_e[k], 20 + k) for k, moved in enumerate(DRIFT_PX)]
-    assert not [use.reason for use in join(frames).frames if "blurred" in (use.reason or "")]
+    reasons = [use.reason or "" for use in join(frames).frames]
+    assert not [reason for reason in reasons if "moved" in reason or "less sharp" in reason]
+
+
+@pytest.mark.parametrize("place", [0, 2])
+def test_each_kind_of_frame_that_one_frame_cannot_tell_is_named_by_the_others(join: BurstJoiner, place: int) -> None:
+    """A read-out that was cut off, two eyes averaged, and a saccade, in one of four frames."""
+    good = [frame(seen(RETINA, moved), 5000, k) for k, moved in enumerate(DRIFT_PX[:3])]
+    both = (seen(RETINA, DRIFT_PX[3]) + seen(OTHER_RETINA, (0, 0))) / 2
+    saccade = (seen(RETINA, (0, 0)) + seen(RETINA, (18, 24))) / 2
+    cut = frame(seen(RETINA, DRIFT_PX[3]), 5000, 7)
+    cut[: SHAPE[0] // 4] = BLACK_DN
+    kinds = {
+        "is black in": cut,
+        "a second image over it": frame(both, 5000, 7),
+        r"moved during its exposure, by about (2[5-9]|3\d) pixels": frame(saccade, 5000, 7),
+    }
+    for words, bad in kinds.items():
+        uses = join([*good[:place], bad, *good[place:]]).frames
+        assert [use.index for use in uses if not use.used] == [place]
+        assert re.search(words, uses[place].reason or "")
+
+
+def test_of_two_frames_the_one_with_a_black_part_is_left_out(join: BurstJoiner) -> None:
+    good, cut = (frame(seen(RETINA, (0, 0)), 5000, k) for k in range(2))
+    cut[:, : SHAPE[1] // 2] = BLACK_DN
+    assert [use.used for use in join([cut, good]).frames] == [False, True]
+
+
+@pytest.mark.parametrize("peak_e", [60, 600, 15000])
+def test_no_frame_of_a_moving_eye_is_black(join: BurstJoiner, peak_e: float) -> None:
+    uses = join([frame(seen(RETINA, moved), peak_e, k) for k, moved in enumerate(DRIFT_PX)]).frames
+    assert not [use.reason for use in uses if "black" in (use.reason or "")]
 
 
 def test_a_burst_with_one_usable_frame_is_that_frame(calibration: Calibration, join: BurstJoiner) -> None:

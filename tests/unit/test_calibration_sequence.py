@@ -226,6 +226,15 @@ def test_calibrate_accepts_a_simulated_head_and_refuses_a_recorded_one(tmp_path:
         Archive(tmp_path / "b").active_id()
 
 
+def test_a_source_that_is_stated_out_of_focus_is_refused_before_any_step(
+    small_bench: CalibrationBench,
+) -> None:
+    job = CalibrationJob(small_bench.world.spec, "D-1", "a technician", "0.1.0", source_mm=25.5)
+    with pytest.raises(CalibrationRefused, match=r"an eye of -0.78 dpt \(at most 0.25\)"):
+        small_bench.calibrate(job)
+    assert small_bench.requested == []
+
+
 def replayed(spec: InstrumentSpec) -> InstrumentSpec:
     return spec.model_copy(update={"camera": spec.camera.model_copy(update={"backend": "replay"})})
 

@@ -48,6 +48,8 @@ def test_the_report_is_the_correcting_lens_as_the_examiner_sees_the_eye() -> Non
     assert report["axis_deg"] == pytest.approx(math.degrees(math.atan2(0.4, -0.3)) / 2)
     assert report["field_deg"] == pytest.approx(33.4)
     assert report["refused"] is None
+    assert report["zero"] == "relative"
+    assert report_of(found(2.0, None), "trial lens")["zero"] == "trial lens"
 
 
 def test_a_refused_refraction_has_no_number() -> None:

@@ -18,12 +18,18 @@ function channelText({ name, predicted, reason }) {
 
 const signed = (dpt) => `${dpt < 0 ? "−" : "+"}${number(Math.abs(dpt), 2)}`;
 
-/** Return the refraction of a report as text: sphere / cylinder x axis, or the mean sphere of a report without a cylinder. */
-export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylinder, axis_deg: axis, refused = null }) {
+/**
+ * Return the refraction of a report as text: sphere / cylinder x axis, or the mean sphere of a report without a cylinder;
+ * with a second sentence where the calibration does not fix its zero.
+ */
+export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylinder, axis_deg: axis, zero = null, refused = null }) {
   if (refused !== null || sphere == null || sd == null) return t("detail.refraction.none");
   const mean = { mean: signed(sphere), sd: number(sd, 2) };
-  if (cylinder == null) return t("detail.refraction.mean", mean);
-  return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
+  const text =
+    cylinder == null
+      ? t("detail.refraction.mean", mean)
+      : t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
+  return zero === "relative" ? `${text}. ${t("detail.refraction.relative")}` : text;
 }
 
 function psfText({ gain_db: gain = null }) {

@@ -111,6 +111,10 @@ function overview(state, actions) {
             <input id="source" name="source" inputmode="decimal" maxlength="6" aria-describedby="source-why" />
           </label>
           <p class="muted" id="source-why">${t("cal.source.why")}</p>
+          <label class="field">${t("cal.distance")}
+            <input id="distance" name="distance" inputmode="decimal" maxlength="6" aria-describedby="distance-why" />
+          </label>
+          <p class="muted" id="distance-why">${t("cal.distance.why")}</p>
         </details>
         ${cal.unfinished.length
           ? html`<p class="kept">${icon("done")} ${t("cal.unfinished", { count: cal.unfinished.length })}</p>`
@@ -268,6 +272,8 @@ function done({ cal }, actions) {
   `;
 }
 
+const ZEROS = { "trial lens": "made.zero.lens", "point source": "made.zero.source", relative: "made.zero.relative" };
+
 function provenance(calibration) {
   const warm = calibration.temperature_c;
   const rows = [
@@ -277,6 +283,7 @@ function provenance(calibration) {
     ["by", calibration.made_by],
     ["temperature",
       warm === null ? t("made.temperature.unknown") : t("made.temperature.value", { v: number(warm, 1) })],
+    ["zero", t(ZEROS[calibration.zero])],
     ["id", calibration.id],
   ];
   return html`<dl>${rows.map(([key, value]) => html`<dt>${t(`made.${key}`)}</dt><dd>${value}</dd>`)}</dl>`;

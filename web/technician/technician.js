@@ -162,6 +162,7 @@ const actions = {
     const options = { by: by.trim() };
     if (form.serial.value.trim()) options.serial = form.serial.value.trim();
     if (form.source.value.trim()) options.source_deg = numberOrText(form.source.value);
+    if (form.distance.value.trim()) options.source_mm = numberOrText(form.distance.value);
     submit("/api/calibration", options);
   },
 

@@ -9,7 +9,7 @@ beam, and scores like another diffuser. One capture may show a blink or a moving
 agree before pictures are refused. The sources of the limits are in device/calibration/decisions/.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from math import hypot
@@ -21,6 +21,14 @@ from device.calibration.archive import Provenance
 from device.calibration.calibration_validity import check_age
 from device.calibration.monitoring.dark_frame import DarkFrameAssessment, assess_dark_frame
 from device.calibration.monitoring.finding import Finding
+from device.calibration.procedure.refraction_zero import (
+    CHANGE,
+    LIKENESS,
+    MAX_ZERO_DPT,
+    MIN_SAME_PATTERN,
+    PATTERN_REMEDY,
+    ZERO_REMEDY,
+)
 from device.errors import CalibrationExpired, CalibrationStale
 from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
 from device.values import Calibration, Counts
@@ -108,7 +116,7 @@ def check(
     refractions: Sequence[ReportedRefraction],
     now: datetime,
 ) -> tuple[Finding, ...]:
-    """Return the findings on age, PSF, field, refraction and darks for which the data suffice; input in any order."""
+    """Return the findings on age, zero, PSF, field, refraction and darks for which the data suffice, in any order."""
     recent = sorted(assessments, key=lambda assessment: assessment.taken_at)
     statements = [
         assessment.statement
@@ -117,6 +125,8 @@ def check(
     ]
     fitting = [statement for statement in statements if statement.upper_limit >= MIN_SCORE][-RECENT_CAPTURES:]
     found = [check_age(provenance, now)] if provenance is not None else []
+    if provenance is not None:
+        found += _zero_findings(calibration, dict(provenance.figures))
     if statements:
         found.append(_psf_finding(statements[-RECENT_CAPTURES:]))
     if fitting:
@@ -187,6 +197,20 @@ def _field_findings(statements: Sequence[PsfMatchResult]) -> list[Finding]:
             "diffuser to the sensor may have changed. Dioptres and micrometres are wrong by that share.",
         ),
     ]
+
+
+def _zero_findings(calibration: Calibration, figures: Mapping[str, float]) -> list[Finding]:
+    """Return the findings on scale (dpt) and pattern (%) of the PSF against the head's calibration before it.
+
+    None without such a calibration, and no scale once trial lenses fix the zero.
+    """
+    found = []
+    if CHANGE in figures and calibration.refraction_offset is None:
+        found.append(_hint("zero", abs(figures[CHANGE]), MAX_ZERO_DPT, "dpt", ZERO_REMEDY))
+    if LIKENESS in figures:
+        unlike = 100 * (1 - figures[LIKENESS])
+        found.append(_hint("pattern", unlike, 100 * (1 - MIN_SAME_PATTERN), "%", PATTERN_REMEDY))
+    return found
 
 
 def _scale_finding(persons: Sequence[float]) -> Finding:

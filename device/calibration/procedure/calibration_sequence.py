@@ -29,6 +29,7 @@ from device.calibration.procedure.flats import MIN_SHARE, Flats, measure_flats
 from device.calibration.procedure.moments import Moments
 from device.calibration.procedure.point_source import MotionCheck, PointSource, measure_point_source, refuse_level
 from device.calibration.procedure.raw_recorder import RawRecorder
+from device.calibration.procedure.refraction_zero import ZeroCheck, compare_zero, earlier_with_zero, is_in_focus
 from device.calibration.procedure.step_exposures import SHORTEST_S, StepExposures
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
@@ -91,6 +92,7 @@ class CalibrationJob:
     """Parameters of one calibration of one head; `source_deg` is the angular diameter of the point source, degrees.
 
     Optional parts: `dioptres` moves the source along the axis behind a model-eye lens of focal length `eye_mm`;
+    `source_mm` is the distance of the point source from that lens if it is stated: the zero of refractions;
     `colours` repeats the point source in these colours (the picture's colour is always measured first); `keep_raw`
     stores every raw frame; `leds` holds radiometer readings of each LED.
     """
@@ -105,6 +107,7 @@ class CalibrationJob:
     colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
     leds: LedReadings | None = None
+    source_mm: float | None = None
 
     @property
     def other_colours(self) -> tuple[Colour, ...]:
@@ -149,17 +152,21 @@ class CalibrationSequence:
         Raises CalibrationRefused with the reason of the step, and the errors of the camera.
         """
         geometry = self._dioptre_geometry()
+        in_focus = is_in_focus(self.job.source_mm, self.job.eye_mm)
         darks = self._checkpointed_step("darks", Darks, "cap", self._measure_darks)
         flats = self._checkpointed_step("flats", Flats, "screen", lambda: self._measure_flats(darks))
         point = self._checkpointed_step("point", PointSource, "point", lambda: self._measure_point(darks, flats))
         self.operator.show_message(f"point: {abs(point.off_px[0])}, {abs(point.off_px[1])} pixels off the middle")
+        zero = self._check_zero(archive, point)
         dioptres = self._measure_dioptres(darks, flats, point, geometry) if geometry is not None else None
         psfs, colours = self._colour_psfs(darks, flats, point)
         calibration = self._build_calibration(darks, flats, psfs, dioptres)
+        calibration = replace(calibration, source_in_focus=in_focus and (zero is None or not zero.contradicts))
         figures = (
             _measurement_figures(darks, flats, point)
             | self._dark_current_figures(archive, darks, flats)
             | _dioptre_figures(dioptres)
+            | ({} if zero is None else zero.figures)
             | colours
         )
         id = archive.add_and_activate(calibration, self._build_provenance(figures))
@@ -222,6 +229,20 @@ class CalibrationSequence:
         self.operator.show_message(
             f"dioptres: {factor:.3%} of stretch each, {factor / nominal - 1:+.1%} beside the drawings"
         )
+        return found
+
+    def _check_zero(self, archive: Archive, point: PointSource) -> ZeroCheck | None:
+        """Return the comparison of the PSF with that of the head's last calibration whose zero is known, and show it.
+
+        None without one, or without [optics].
+        """
+        job = self.job
+        earlier = earlier_with_zero(archive, job.serial)
+        if earlier is None or job.geometry is None:
+            return None
+        found = compare_zero(earlier, point.psf, job.spec.light.colour, job.geometry)
+        if found is not None:
+            self.operator.show_message(found.words)
         return found
 
     def _dark_current_figures(self, archive: Archive, darks: Darks, flats: Flats) -> dict[str, float]:

@@ -1,12 +1,14 @@
 """Registration of the frames of a burst: the shift of each, and which of them do not show what the others show.
 
-Two tests, NUMERICS.md 9.1: the correlation with the central frame finds lids, closed eyes and other retinas; that with
-the mean of the other frames, which has less noise, finds motion blur.
+Three tests, NUMERICS.md 9.1: the correlation with the central frame finds lids, closed eyes and other retinas; that
+with the mean of the other frames, which has less noise, finds frames that are less sharp; a second, displaced copy of
+that mean in a frame is motion of the eye during its exposure.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
+from math import hypot
 
 import numpy as np
 
@@ -18,6 +20,26 @@ MIN_OF_TYPICAL = 0.75  # of the better half's median correlation; a frame half c
 MIN_SHARPNESS = 0.965  # of the expected correlation: 0.98 or more with 8 pixels of motion blur, 0.9 to 0.96 with 15
 MIN_SCATTER = 5.0  # standard deviations of the frames' correlations below their median
 FEWEST = 3  # frames that show which one is blurred
+MIN_COPY, MIN_COPY_SD = 0.25, 8.0  # correlation of a second copy: still eyes 0.2 and less, NUMERICS.md 9.1
+MIN_COPIED = 0.5  # of the power that the others explain of a usual frame: other retinas 0.35 and less
+OTHER = "does not show what the other frames show"
+IN_PART = "shows in part only what the other frames show: a lid, or a second image over it"
+LESS_SHARP = "is less sharp than the other frames: out of focus, or a second image over it"
+MOVED = "shows an eye that moved during its exposure, by about {px:.0f} pixels"
+NONE_MATCH = "no two frames show the same retina"
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Detail of a frame and the mean detail of the others, in their common window, and its registration to them.
+
+    The shift of the registration is that of the whole frame; `left_px` is the part of it that the window still has.
+    """
+
+    others: Detail
+    detail: Detail
+    registration: Registration
+    left_px: Shift
 
 
 def register_group(
@@ -27,45 +49,45 @@ def register_group(
 
     `flats` are flat pictures (`Registrar.flat`) by index, `light` is the mean light of each frame in any unit. The
     centre is the frame that correlates best with all others; a frame matches if its correlation with the centre is near
-    that of most frames, and if it is as sharp as the others. Where no two frames match, nothing says which of them
-    shows the retina, and the first one is kept.
+    that of most frames, if it is as sharp as the others, and if the eye did not move during its exposure. Where no two
+    frames match, nothing says which of them shows the retina, and the first one is kept.
     """
     indices = list(flats)
     found = _pairs(registrar, {k: registrar.detail(flat) for k, flat in flats.items()})
     centre = max(indices, key=lambda i: sum(found[i, k].correlation for k in indices if k != i))
-    level = {k: found[centre, k].correlation for k in indices if k != centre}
-    least = _least_correlation([found[centre, k] for k in level])
-    used = [k for k in indices if k == centre or level[k] >= least]
+    level = {k: found[centre, k] for k in indices if k != centre}
+    least = _least_correlation(list(level.values()))
+    near = {k: (0.0, 0.0) if k == centre else found[centre, k].shift_px for k in indices}
+    used = [k for k in indices if k == centre or level[k].correlation >= least]
     if len(used) == 1:
-        return {indices[0]: (0.0, 0.0)}, dict.fromkeys(indices[1:], "no two frames show the same retina")
-    reasons = {
-        k: f"does not show what the other frames show (correlation {level[k]:.2f}, at least {least:.2f})"
-        for k in indices
-        if k not in used
-    }
-    near = {k: (0.0, 0.0) if k == centre else found[centre, k].shift_px for k in used}
-    refined = _refined(registrar, {k: flats[k] for k in used}, near)
-    if blurred := _blurred(refined, light):
-        reasons |= blurred
-        near = {k: registration.shift_px for k, registration in refined.items() if k not in blurred}
-        refined = _refined(registrar, {k: flats[k] for k in near}, near)
-    first = refined[min(refined)].shift_px
-    shifts = {
-        k: (registration.shift_px[0] - first[0], registration.shift_px[1] - first[1])
-        for k, registration in refined.items()
-    }
+        return {indices[0]: (0.0, 0.0)}, dict.fromkeys(indices[1:], NONE_MATCH)
+    compared = _compared(registrar, flats, near, used)
+    reasons = _less_sharp(registrar, compared, light)
+    typical = float(np.median([one.registration.correlation for one in compared.values()]))
+    for k in set(indices) - set(used):
+        one = _compared(registrar, flats, near, [*used, k])[k]
+        words = IN_PART if level[k].correlation >= MIN_SD * level[k].sd else OTHER
+        reasons[k] = _reason(_moved_words(registrar, one, typical) or words, level[k].correlation, least)
+    if set(used) & set(reasons):
+        used = [k for k in used if k not in reasons]
+        near = {k: compared[k].registration.shift_px for k in used}
+        compared = _compared(registrar, flats, near, used)
+    first = compared[min(used)].registration.shift_px
+    shifts = {k: _difference(one.registration.shift_px, first) for k, one in compared.items()}
     return shifts, reasons
 
 
-def _blurred(found: Mapping[int, Registration], light: Mapping[int, float]) -> dict[int, str]:
-    """Return the reason of each frame that is less sharp than most, by its correlation with the mean of the others.
+def _less_sharp(registrar: Registrar, compared: Mapping[int, _Compared], light: Mapping[int, float]) -> dict[int, str]:
+    """Return the reason of each frame that is less sharp than most, by its correlation with the mean of the others, or
+    that shows a moved eye.
 
     The expected correlation is sqrt(p / (1 + p)), p being the signal-to-noise ratio of the median frame, times the
     light of this one over the median light if it has less. Fewer than FEWEST frames do not show which one is blurred,
     and two are always kept.
     """
-    if len(found) < FEWEST:
+    if len(compared) < FEWEST:
         return {}
+    found = {k: one.registration for k, one in compared.items()}
     values = np.clip([registration.correlation for registration in found.values()], 0.0, 0.999)
     typical = float(np.median(values))
     usual = float(np.median([light[k] for k in found]))
@@ -77,9 +99,31 @@ def _blurred(found: Mapping[int, Registration], light: Mapping[int, float]) -> d
         power = signal * min(light[k] / usual, 1.0)
         expected = float(np.sqrt(power / (1 + power)))
         least = min(MIN_SHARPNESS * expected, expected - MIN_SCATTER * scatter)
-        if registration.correlation < least:
-            reasons[k] = f"is blurred by motion (correlation {registration.correlation:.2f}, at least {least:.2f})"
+        words = _moved_words(registrar, compared[k], typical)
+        if words or registration.correlation < least:
+            reasons[k] = _reason(words or LESS_SHARP, registration.correlation, least)
     return reasons if len(found) - len(reasons) >= 2 else {}
+
+
+def _moved_words(registrar: Registrar, one: _Compared, typical: float) -> str | None:
+    """Return the words for a frame that shows a second, displaced copy of the others; None without one.
+
+    `typical` is the correlation of a usual frame with the others.
+    """
+    found = replace(one.registration, shift_px=one.left_px)
+    copy = registrar.register(one.others, registrar.rest(one.others, one.detail, found))
+    explained = found.correlation**2 + (1 - found.correlation**2) * copy.correlation**2
+    if copy.correlation < max(MIN_COPY, MIN_COPY_SD * copy.sd) or explained < MIN_COPIED * typical**2:
+        return None
+    return MOVED.format(px=hypot(*_difference(copy.shift_px, found.shift_px)))
+
+
+def _reason(words: str, correlation: float, least: float) -> str:
+    return f"{words} (correlation {correlation:.2f}, at least {least:.2f})"
+
+
+def _difference(left: Shift, right: Shift) -> Shift:
+    return left[0] - right[0], left[1] - right[1]
 
 
 def _pairs(registrar: Registrar, details: dict[int, Detail]) -> dict[tuple[int, int], Registration]:
@@ -100,18 +144,22 @@ def _least_correlation(found: Sequence[Registration]) -> float:
     return max(MIN_SD * sd, MIN_OF_TYPICAL * float(np.median(better)) - 2 * sd)
 
 
-def _refined(registrar: Registrar, flats: Mapping[int, Image], shifts: Mapping[int, Shift]) -> dict[int, Registration]:
-    """Return shift and correlation of each picture after its registration, moved back, to the mean of the others.
+def _compared(
+    registrar: Registrar, flats: Mapping[int, Image], shifts: Mapping[int, Shift], indices: Iterable[int]
+) -> dict[int, _Compared]:
+    """Return the comparison of each of these pictures, moved back by its shift, with the mean of the others.
 
     The mean has less noise than one picture. All are windowed to the part of the retina that is on each of them: the
     window does not pull the shift towards 0, and the correlations can be compared.
     """
-    moved = {k: registrar.moved_back(flat, shifts[k]) for k, flat in flats.items()}
+    moved = {k: registrar.moved_back(flats[k], shifts[k]) for k in indices}
     common = np.min([window for _, window in moved.values()], axis=0)
     details = {k: registrar.windowed(image, common) for k, (image, _) in moved.items()}
-    refined = {}
+    compared = {}
     for k, detail in details.items():
-        found = registrar.register(registrar.mean([details[i] for i in details if i != k]), detail)
+        others = registrar.mean([details[i] for i in details if i != k])
+        found = registrar.register(others, detail)
         row, col = found.shift_px
-        refined[k] = replace(found, shift_px=(shifts[k][0] + row, shifts[k][1] + col))
-    return refined
+        whole = replace(found, shift_px=(shifts[k][0] + row, shifts[k][1] + col))
+        compared[k] = _Compared(others, detail, whole, found.shift_px)
+    return compared

@@ -120,6 +120,14 @@ class Registrar:
             best, peak = self._refined(inside, best, step)
         return Registration((best[0] * self._n, best[1] * self._n), peak, float(around.std()))
 
+    def rest(self, reference: Detail, moved: Detail, found: Registration) -> Detail:
+        """Return the detail of `moved` that the displaced reference does not explain, of unit energy."""
+        row, col = (shift / self._n for shift in found.shift_px)
+        turn = np.exp(-2j * np.pi * (self._rows[:, None] * row + self._cols[None] * col))
+        spectrum = moved.spectrum.copy()
+        spectrum[self._box] -= (found.correlation * turn * reference.spectrum[self._box]).astype(np.complex64)
+        return Detail(self._unit(spectrum))
+
     def _refined(self, cross: Complexes, near: Shift, step: float) -> tuple[Shift, float]:
         """Return the place and height of the highest correlation on a 9 x 9 lattice of `step` samples around `near`.
 

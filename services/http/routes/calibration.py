@@ -95,7 +95,9 @@ def _write_router(arbiter: HeadArbiter) -> APIRouter:
 
         409 while a calibration is under way or the instrument starts, 401 without a login.
         """
-        arbiter.calibrate(CalibrationRequest(arbiter.context.archive.root, start.serial, start.by, start.source_deg))
+        root = arbiter.context.archive.root
+        request = CalibrationRequest(root, start.serial, start.by, start.source_deg, source_mm=start.source_mm)
+        arbiter.calibrate(request)
         return calibration_state(arbiter)
 
     @router.post("/ready")
@@ -234,6 +236,7 @@ def intact_calibration(stored: StoredCalibration) -> IntactCalibration:
         software=made.software,
         temperature_c=made.temperature_c,
         simulated=calibration.simulated,
+        zero=calibration.refraction_zero,
         numbers=numbers,
         damaged=None,
         in_force=False,

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
+from device.values import RefractionZero
 from services.http.schemas.common import KEY_PATTERN, RequestBody, ResponseBody
 from services.http.schemas.problems import ErrorText
 from services.http.schemas.status import FindingAnswer
@@ -13,11 +14,16 @@ from services.records.json_values import Timestamp
 
 
 class CalibrationStart(RequestBody):
-    """Request body: operator, serial number of the head (null: the stored one), and source diameter in degrees."""
+    """Request body: operator, serial number of the head (null: the stored one), and the point source.
+
+    `source_deg`: its diameter in degrees; `source_mm`: its distance from the lens of the model eye in mm, which fixes
+    the zero of the refraction (null: not stated).
+    """
 
     by: str = Field(min_length=1, max_length=60, pattern=r"^[^\x00-\x1f]*\S[^\x00-\x1f]*$")
     serial: str | None = Field(default=None, min_length=1, max_length=60, pattern=r"^[^\x00-\x1f]*\S[^\x00-\x1f]*$")
     source_deg: float | None = Field(default=None, ge=0, le=5)
+    source_mm: float | None = Field(default=None, ge=5, le=100)
 
 
 class TargetReady(RequestBody):
@@ -64,7 +70,10 @@ class DamagedCalibration(ResponseBody):
 
 
 class IntactCalibration(ResponseBody):
-    """A calibration of the archive: its origin, its measured figures (`numbers`), and whether it is in force."""
+    """A calibration of the archive: its origin, its measured figures (`numbers`), and whether it is in force.
+
+    `zero`: what fixes the zero of the refraction.
+    """
 
     id: str
     damaged: None
@@ -76,6 +85,7 @@ class IntactCalibration(ResponseBody):
     software: str
     temperature_c: float | None
     simulated: bool
+    zero: RefractionZero
 
 
 ArchivedCalibration = IntactCalibration | DamagedCalibration

@@ -4,6 +4,7 @@ The steps of the field edge (`edge`) need a start within the structure of the ca
 pupil or an uneven lamp is wider. The Wiener picture of the frame, with the PSF of the M found so far and a spectrum
 f^-2.5 of the detail, shows the border itself: in each direction the field ends at the outermost radius with a third of
 the usual light, and a circle is fitted to these radii without those that deviate (a lid, NUMERICS.md 7.5).
+It needs a field that is nearly known; `assessment/lit_disc` finds the disc of files, and says why there are two.
 """
 
 import numpy as np

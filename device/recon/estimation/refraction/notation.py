@@ -13,6 +13,7 @@ import math
 from typing import NamedTuple
 
 from device.recon.estimation.refraction.estimator import NoRefraction, Refraction
+from device.values import RefractionZero
 
 SCATTER_KEYS = ("frames", "sd_dpt", "stated_sd_dpt", "chi2")
 REFRACTION_KEYS = (
@@ -27,6 +28,7 @@ REFRACTION_KEYS = (
     "axis_deg",
     "field_deg",
     "field_deg_sd",
+    "zero",
     "refused",
 )
 
@@ -46,8 +48,8 @@ def sphere_cylinder(m_dpt: float, j0_dpt: float, j45_dpt: float) -> SphereCylind
     return SphereCylinder(m_dpt + half_dpt, -2 * half_dpt, axis_deg if axis_deg > 0 else 180.0)
 
 
-def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]:
-    """Return `refraction_dpt` of a report: the numbers and no reason, or the reason and no number.
+def report_of(found: Refraction | NoRefraction, zero: RefractionZero = "relative") -> dict[str, float | str | None]:
+    """Return `refraction_dpt` of a report: the numbers and what fixes their zero, or the reason without any.
 
     Without a cylinder its figures are null.
     """
@@ -59,6 +61,7 @@ def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]
         "sd": found.sd_dpt,
         "field_deg": found.edge.diameter_deg,
         "field_deg_sd": found.edge.diameter_sd_deg,
+        "zero": zero,
     }
     if (cylinder := found.cylinder) is not None:
         lens = sphere_cylinder(-found.m_dpt, -cylinder.j0_dpt, cylinder.j45_dpt)
