@@ -26,8 +26,9 @@ from device.clock import Deadline, SystemClock
 from device.config.head_file import load_head
 from device.errors import SettingError
 from device.recon.burst_reconstructor import BurstReconstructor
+from device.recon.frame_run import EyePsf
 from device.recon.model.fft_plans import Planner
-from device.recon.reconstructor import EyePsf, Reconstructor
+from device.recon.reconstructor import Reconstructor
 from device.sim.scene_files import expose
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Reconstruction
@@ -70,7 +71,7 @@ class Presses:
 
 
 def _is_stated(refraction: object) -> bool:
-    return isinstance(refraction, dict) and refraction.get("m_dpt") is not None
+    return isinstance(refraction, dict) and refraction.get("sphere") is not None
 
 
 class Press:
@@ -124,7 +125,8 @@ def loaded(workers: int) -> Iterator[None]:
     program = shutil.which("stress-ng")
     if program is None:
         raise SettingError("stress-ng is not installed", "Run make bench-deadline, which installs it.")
-    with subprocess.Popen([program, "--quiet", "--cpu", str(workers)]) as load:
+    command = [program, "--quiet", "--cpu", str(workers)]
+    with subprocess.Popen(command, start_new_session=True) as load:  # another program, as one from another terminal
         try:
             yield
         finally:
