@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace lint release bench bench-archive bench-attacks bench-budget bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace stress-ng lint release bench bench-archive bench-attacks bench-budget bench-data bench-deadline bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -228,6 +228,9 @@ test-other: .other-venv/ready buses ## Run the contract suites on another Python
 strace: ## Install strace (Debian package) where it is missing.
 	@tests/hard/install
 
+stress-ng: ## Install stress-ng (Debian package) where it is missing.
+	@tests/bench/install
+
 buses: ## Install umockdev (Debian packages) where it is missing.
 	@tests/ports/emulators/install
 
@@ -259,7 +262,7 @@ release: lint ## Check version, changelog and citation, build wheel and source a
 	@rm -rf dist && $(BIN)/python -m hatchling build -d dist
 	@echo "dist/ holds $(VERSION); to publish: git push origin v$(VERSION)"
 
-bench: .venv/ready browser ## Print figures of speed and truth, measured on this machine.
+bench: .venv/ready browser stress-ng ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
 COUNT ?= 2000
@@ -272,6 +275,9 @@ bench-attacks: .venv/ready ## Measure status and press while clients hold connec
 
 bench-budget: .venv/ready ## Press 60 times for each choice of the time budget: times from read-out and tap, rounds, colour.
 	@$(BIN)/python -m tests.bench.budgets
+
+bench-deadline: .venv/ready stress-ng ## Make 200 pictures within each of four time budgets beside stress-ng --cpu 4: late ones, rounds, PCC.
+	@$(BIN)/python -m tests.bench.deadline
 
 bench-pi: .venv/ready ## Print the factor of this board over the reference: one planned FFT pair and one reconstruction.
 	@$(BIN)/python -m tests.bench.pi

@@ -161,13 +161,12 @@ class BurstJoiner:
         `look`: its quick look, if there is one and quick looks are registered. FrameError without light or with too
         many missing pixels.
         """
-        counts = self._single.lines(plane(frame, 0), dark).counts
         if look is None or not self.registers_quick_looks:
-            look = self._single.quick_look(counts, dark)
+            look = self._single.quick_look(plane(frame, 0), dark)
         require_light(look)
         # A preprocessor of its own: its light is the result, and that of all frames is needed at once.
         full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
-        linear = full(counts, dark, look.defects[0])
+        linear = full(look.even.counts, dark, look.defects[0])
         return SeenFrame(linear.y, linear.good > 0, look.planes[0], linear.mean_dn, look.solved.frame.saturated)
 
     def _field(self, pictures: Sequence[Image]) -> Image:

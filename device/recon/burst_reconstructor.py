@@ -17,13 +17,14 @@ from device.errors import FrameError
 from device.recon.assessment.quality_figures import is_banded
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame, require_light
 from device.recon.corrections import is_steadier, with_corrections
+from device.recon.durations import LEAST_RUNS, DurationEstimate
 from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.frame_run import EyePsf
 from device.recon.frames import checked, noise_frame
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
-from device.recon.stage import DurationEstimate, QuickLook, RoundDone, Step
+from device.recon.stage import QuickLook, RoundDone, Step
 from device.values import FrameUse, Reconstruction
 
 NO_TIME = "the time budget left no time to join it"
@@ -72,17 +73,19 @@ class BurstReconstructor:
         self.single = single
         self.clock = single.clock
         self.joiner = BurstJoiner(calibration, shape, planner, single.clock, index, single)
-        self.see_cost = DurationEstimate()  # of one frame
-        self.join_cost = DurationEstimate()
+        self.see_cost = DurationEstimate(single.stages[0].pace)  # of one frame
+        self.join_cost = DurationEstimate(single.stages[0].pace)
         if timed:
             self._warm_up()
 
     def _warm_up(self) -> None:
         """Join two frames of noise, to compile the kernels and to measure the cost."""
         noise = noise_frame(self.single.calibration, self.single.shape)
-        for _ in range(2):  # the first one compiles
-            self.see_cost = DurationEstimate()
-            self.join_cost = DurationEstimate()
+        pace = self.single.stages[0].pace
+        for k in range(1 + LEAST_RUNS):
+            if k == 1:  # the first one compiles
+                self.see_cost = DurationEstimate(pace)
+                self.join_cost = DurationEstimate(pace)
             run = _Run(self, None)
             for step in run.join([noise, noise], np.zeros_like(noise)):
                 assert isinstance(step, RoundDone)
@@ -121,8 +124,8 @@ class BurstReconstructor:
         FrameError
             The frame has no light, too many missing pixels, or rows that are repeated or missing.
         """
-        counts = self.single.lines(counts, dark).counts
         look = self.single.quick_look(counts, dark)
+        counts = look.even.counts
         require_light(look)
         seen = None if alone else self.joiner.see(counts, dark, look)
         task = None
@@ -196,8 +199,8 @@ class BurstReconstructor:
         yield looks[first].stage
         unusable = known_bad if joined else self._within_time(run, frames, ready, known_bad)
         if NO_TIME in unusable.values() and len(unusable) == len(frames) - 1:
-            self.see_cost.halve_maximum()
-            self.join_cost.halve_maximum()
+            self.see_cost.skipped(usually_fits=False)  # a trial that takes too long would cost the picture its rounds
+            self.join_cost.skipped(usually_fits=False)
             uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, unusable.get(k)) for k in range(len(frames))]
             yield from run.solve_one(frames[first], dark, uses, first, simulated, tasks.get(first), looks[first])
             return
@@ -330,7 +333,7 @@ class BurstReconstructor:
         """Return the estimated duration of joining the frames, in seconds; those that are `ready` cost less."""
         usable = [k for k in range(len(frames)) if k not in (unusable or {})]
         unseen = sum(k not in ready for k in usable)
-        return unseen * self.see_cost.seconds + len(usable) * self.join_cost.seconds
+        return self.see_cost.seconds_of(unseen) + self.join_cost.seconds_of(len(usable))
 
 
 def _seen(prepared: Mapping[int, PreparedFrame]) -> dict[int, SeenFrame]:

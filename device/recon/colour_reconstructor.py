@@ -16,13 +16,14 @@ from device.clock import Deadline
 from device.errors import FrameError
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour import ColourPicture, join_colours
+from device.recon.durations import DurationEstimate
 from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, picture_otf, transform
 from device.recon.frame_run import EyePsf
 from device.recon.model.field_of_view import field_box, field_radius_px, lit_field
 from device.recon.model.grid import Grid, disc
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
-from device.recon.stage import DurationEstimate, RoundDone, Step
+from device.recon.stage import RoundDone, Step
 from device.recon.white_balance import balanced, white_ratios
 from device.values import ChannelUse, Colour, Geometry, Image, Reconstruction, Report
 
@@ -83,7 +84,7 @@ class ColourReconstructor:
         self._calibration, self._reference = calibration, reference
         self.others = others
         self.clock = green.clock
-        self.join_cost = DurationEstimate()
+        self.join_cost = DurationEstimate(green.stages[0].pace)
         self.singles = {
             colour: solver.single if isinstance(solver, BurstReconstructor) else solver
             for colour, solver in others.items()

@@ -11,6 +11,7 @@ import numpy as np
 
 from device.errors import FrameError
 from device.recon.assessment.quality_figures import is_banded, states_misfit
+from device.recon.durations import DurationEstimate, Pace
 from device.recon.estimation.flicker import FlickerFinder
 from device.recon.estimation.spots import Spots, on_sensor
 from device.recon.estimation.uneven_light import FALLS
@@ -87,14 +88,19 @@ class Corrections:
         Dark frame of a frame without its own.
     solve
         Solver of a run: yields the steps before the picture, and returns the picture.
+    pace
+        Pace of the machine.
     """
 
-    def __init__(self, calibration: Calibration, shape: tuple[int, int], dark_dn: Image, solve: Solve) -> None:
+    def __init__(
+        self, calibration: Calibration, shape: tuple[int, int], dark_dn: Image, solve: Solve, pace: Pace
+    ) -> None:
         self.flicker = FlickerFinder(dark_dn, calibration.sensor.white_dn)
         self._white_dn = calibration.sensor.white_dn
         self._shape = shape
         self._dark_dn = dark_dn
         self._solve = solve
+        self._search_cost = DurationEstimate(pace)  # of the search for uneven light
 
     def __call__(self, run: FrameRun, made: Reconstruction) -> Generator[Step, None, Reconstruction]:
         """Yield the steps of the corrected frames of a run, and return the best picture.
@@ -142,12 +148,15 @@ class Corrections:
     def _in_even_light(self, whole: Solution) -> Generator[Step, None, Solution]:
         """Return the solution of the frame as in even light, if its residual falls much."""
         run, before = whole.run, _unevenness(whole.run)
-        if before is None or run.diagnostics is None:
+        find = None if run.diagnostics is None else run.diagnostics.find_uneven
+        if before is None or find is None or not run.fits(self._search_cost.seconds + whole.duration_s):
             return whole
-        tried = []
+        begin_s, tried = run.clock.now_s(), []
+        lights = find()
+        self._search_cost.add(run.clock.now_s() - begin_s)
         _, dark, _ = run.channel(0)
         offset = self._dark_dn if dark is None else np.asarray(dark, np.float32)
-        for light in run.diagnostics.uneven:
+        for light in lights:
             if not run.fits(whole.duration_s):
                 break
             again = yield from self._again(run.again(light.without(run.counts, offset, self._white_dn, run.done.grid)))

@@ -149,9 +149,9 @@ class FrameRun:
 
     def has_time_for(self, stage: Stage) -> bool:
         """Return whether a stage runs: the first one always, a later one if there is time; else record the reason."""
-        if self.solved is not None and not self.fits(self.cost_s(stage)):
+        if self.deadline is not None and self.solved is not None and not self.fits(self.cost_s(stage)):
             self.stopped = "deadline"
-            stage.halve_costs()
+            stage.skipped(self.deadline.left_s() / self.channels)
             return False
         return True
 
@@ -175,6 +175,8 @@ class FrameRun:
             frame = replace(stage.joined_preparer(plane(joined, c)), saturated=saturated)
         stage.solver.start(frame)
         now_s = self.clock.now_s()
+        if stage is self._first:
+            stage.pace.add(now_s - begin_s)
         stage.start_cost.add(now_s - begin_s)
         self.stopped = "done"
         most = stage.most if self.asked.rounds is None else min(self.asked.rounds, stage.most)

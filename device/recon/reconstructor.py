@@ -29,6 +29,7 @@ from device.recon.assessment.quality_figures import (
     quality_warnings,
 )
 from device.recon.corrections import Corrections
+from device.recon.durations import LEAST_RUNS, Pace, RefractionCosts
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.flicker import FlickerFinder
 from device.recon.estimation.power_law_prior import PowerLaw
@@ -51,11 +52,10 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.kernels import Pixels, Places
 from device.recon.model.resampling import to_sensor
-from device.recon.stage import DurationEstimate, QuickLook, Recipe, Stage, StageResult, Step, default_schedule
+from device.recon.stage import QuickLook, Recipe, Stage, StageResult, Step, default_schedule
 from device.values import Calibration, Image, Reconstruction, RefractionOffset, Report
 
 Check = Future[Consistency | None]
-CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
 
 
 class Reconstructor:
@@ -67,7 +67,8 @@ class Reconstructor:
     first stage (before a single one). The later stages use the PSF warped accordingly, or the stored PSF if
     there is no reliable estimate. It is estimated in a thread, and its cylinder, if it fits into the
     deadline, while the picture is solved. The PSF of the picture has the cylinder only if that is known
-    before the solution begins: a deadline does not wait for it.
+    before the solution begins: a deadline does not wait for it, nor for a refraction that would cost the
+    picture its rounds. The report has what is known when the picture is made.
 
     Parameters
     ----------
@@ -128,6 +129,7 @@ class Reconstructor:
         self.psf_index = psf_index
         self._audience = audience
         self._consistency = None if timed else consistency
+        pace = Pace()
         with ThreadPoolExecutor(1, "planning") as aside:
             refractor = None
             if refract and can_estimate_refraction(calibration):
@@ -136,17 +138,15 @@ class Reconstructor:
             if timed and refractor is not None:
                 wait([refractor])  # the fastest transforms are measured one after the other
             self.stages = [
-                Stage(recipe, method_named(recipe.method, methods), calibration, shape, planner, psf_index)
+                Stage(recipe, method_named(recipe.method, methods), calibration, shape, planner, psf_index, pace)
                 for recipe in recipes
             ]
             self.defects = DefectFinder(calibration, shape, psf_index)
-        self.corrections = Corrections(calibration, shape, self.defects.dark, self._solve)
+        self.corrections = Corrections(calibration, shape, self.defects.dark, self._solve, pace)
         self.lines = LineFinder(self.defects.dark, calibration.sensor.white_dn, calibration.psfs[psf_index])
         self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
-        self._find_cost = DurationEstimate()
-        self._refocus_cost = DurationEstimate()
-        self._cylinder_cost = DurationEstimate()
+        self._costs = RefractionCosts(pace)
         self._gain = None if self.refractor is None else PsfGain(self.stages[-1].model)
         if timed:
             self._warm_up()
@@ -158,15 +158,12 @@ class Reconstructor:
         self(noise, rounds=1)  # compiles, if the cache of compiled code is empty
         self(noise, np.zeros_like(noise), quick=True)  # a dark frame selects another compiled signature
         for stage in self.stages:
-            stage.start_cost = DurationEstimate()
-            stage.round_cost = DurationEstimate()
-            stage.end_cost = DurationEstimate()
-            stage.finish_cost = DurationEstimate()
-        self._find_cost = DurationEstimate()
-        self._cylinder_cost = DurationEstimate()
-        self(noise, rounds=2)
-        for eye in (Wavefront(1.0), None):
-            self._refocus(eye)
+            stage.forget_costs()
+        self._costs = RefractionCosts(self.stages[0].pace)
+        for _ in range(LEAST_RUNS):
+            self(noise, rounds=2)
+            for eye in (Wavefront(1.0), None):
+                self._refocus(eye)
 
     def __call__(
         self,
@@ -269,7 +266,7 @@ class Reconstructor:
             The frame has another shape than the sensor, too many pixels are missing (`Preprocessor`), or rows are
             repeated or missing (`RowOrder`).
         """
-        counts, noise = self.lines(checked(counts, self.shape), dark)
+        counts, noise = self.lines(checked(counts, self.shape), dark) if look is None else look.even
         asked = Asked(dark, simulated, rounds, quick, eye_psf)
         run = FrameRun(self.stages[0], self.defects, self.clock, asked, counts, joined, deadline)
         made = yield from self._solve(run, Known(refraction, others, look))
@@ -278,7 +275,8 @@ class Reconstructor:
 
     def _solve(self, run: FrameRun, known: Known = NOTHING) -> Generator[Step, None, Reconstruction]:
         """Yield the steps before the picture, and return the picture."""
-        asked, task = run.asked, known.refraction
+        asked = run.asked
+        task = known.refraction if asked.eye_psf is EyePsf.ESTIMATED else None
         check: Check | None = None
         begin_s = self.clock.now_s()
         stages = self.stages[:1] if asked.quick else self.stages
@@ -302,14 +300,17 @@ class Reconstructor:
         solved_s = self.clock.now_s()
         picture = to_sensor(run.done.picture, run.done.grid)
         finished_s = self.clock.now_s()
-        run.done.finish_cost.add(finished_s - solved_s)
         solve_s = solved_s - begin_s - run.refraction_s - run.cylinder_s - run.between_s
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
-        if task is not None and isinstance(run.refraction, Refraction):
-            self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
+        if task is not None and task.has_found:
+            self._take_cylinder(run, task, wait=run.fits(self._costs.cylinder_s))
         if isinstance(run.refraction, Refraction) or run.cylinder_s > 0:
             seconds["cylinder"] = run.cylinder_s
-        return Reconstruction(picture, self._report(run, seconds, check), asked.simulated)
+        known_s = self.clock.now_s()
+        report = self._report(run, seconds, check)
+        if self._consistency is None:  # whose test is outside the deadline
+            run.done.finish_cost.add(finished_s - solved_s + self.clock.now_s() - known_s)
+        return Reconstruction(picture, report, asked.simulated)
 
     def quick_look(self, counts: Pixels, dark: Pixels | None = None) -> QuickLook:
         """Return the first stage of a frame, for `steps` of this frame.
@@ -333,12 +334,12 @@ class Reconstructor:
         """
         asked = Asked(dark, simulated=False, rounds=None, quick=True, eye_psf=EyePsf.STORED)
         stage = self.stages[0]
-        counts = self.lines(checked(counts, self.shape), dark).counts
-        run = FrameRun(stage, self.defects, self.clock, asked, counts)
+        even = self.lines(checked(counts, self.shape), dark)
+        run = FrameRun(stage, self.defects, self.clock, asked, even.counts)
         deque(run.solve(stage, pauses=False), maxlen=0)
         assert run.solved is not None
         shown = StageResult(stage.recipe, stage.shown.copy(), last=stage is self.stages[-1])
-        return QuickLook(shown, stage.planes.copy(), run.solved, run.found)
+        return QuickLook(shown, stage.planes.copy(), run.solved, run.found, even)
 
     def _begin_check(self, run: FrameRun, stage: Stage) -> Check | None:
         """Begin the PSF consistency check of a frame of one stage in a thread, beside its solver; not with a deadline.
@@ -384,56 +385,62 @@ class Reconstructor:
         if self.refractor is None:
             return None
         frame = counts, dark, defects
-        return RefractionTask(self.refractor, self._refraction_lock, self.clock, frame, with_cylinder)
+        took = self._costs.find.add
+        return RefractionTask(self.refractor, self._refraction_lock, self.clock, frame, with_cylinder, took)
 
     def _estimate_refraction(
         self, run: FrameRun, task: RefractionTask | None, others: Sequence[Pixels]
     ) -> RefractionTask | None:
-        """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
+        """Estimate the refraction, and set the OTF of the later stages to it, or to that of the stored PSF.
 
-        `task`: that of the frame, if it has begun: once it has found the refraction, the estimate takes no time.
-        `others`: the other frames of its burst, which are joined without a deadline only. Return the task, None without
-        a refractor; without time `task` as it is.
+        It begins if it usually leaves the picture its reserved rounds, and is not waited for beyond that. `task`: that
+        of the frame, if it has begun. `others`: the other frames of its burst, which are joined without a deadline
+        only. Return the task; None without a refractor, or if none has begun.
         """
         begin_s = self.clock.now_s()
-        eye = None
         if self.refractor is None:
             return None
-        find_s = 0.0 if task is not None and task.has_found else self._find_cost.seconds
-        cost_s = find_s + self._refocus_cost.seconds + run.cost_s(_refracted(self.stages)[0], reserved=True)
-        if run.fits(cost_s):
-            with_cylinder = run.fits(cost_s + self._cylinder_s)
-            if not with_cylinder:
-                self._cylinder_cost.halve_maximum()
-            task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
-            assert task is not None
+        stage, costs = _refracted(self.stages)[0], self._costs
+        reserved_s = costs.refocus.seconds + run.cost_s(stage, reserved=True)
+        until = None if run.deadline is None else run.deadline.later(-reserved_s)
+        if task is None:
+            task = self._begin_in_time(run, until)
+        eye = None
+        if task is not None and task.has_found_by(until) and run.fits(costs.refocus.seconds + run.cost_s(stage)):
             if others and run.deadline is None:
                 task.join([self.lines(plane(other, 0), run.asked.dark).counts for other in others])
             run.refraction = task.found()
-            self._find_cost.add(task.find_s)
             self._take_cylinder(run, task, wait=run.deadline is None)
             best = run.refraction if isinstance(run.refraction, Refraction) else task.best()
             eye = best.psf_wavefront if isinstance(best, Refraction) else None
-        else:
-            max(self._find_cost, self._refocus_cost, key=lambda cost: cost.seconds).halve_maximum()
         self._refocus(eye)
         run.refraction_s = self.clock.now_s() - begin_s - run.cylinder_s
         return task
 
-    @property
-    def _cylinder_s(self) -> float:
-        """Estimated duration of the search for a cylinder and of the joining with other frames in seconds."""
-        return max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
+    def _begin_in_time(self, run: FrameRun, until: Deadline | None) -> RefractionTask | None:
+        """Begin to estimate the refraction if it usually ends by `until`, and with the cylinder if that does, too."""
+        costs = self._costs
+        find_s = costs.find.typical_s
+        if until is not None and not until.fits(find_s):
+            costs.find.skipped(usually_fits=False)
+            costs.refocus.skipped(usually_fits=False)
+            return None
+        with_cylinder = until is None or until.fits(find_s + costs.cylinder_s)
+        if not with_cylinder:
+            costs.cylinder.skipped(usually_fits=False)
+        return self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
 
     def _take_cylinder(self, run: FrameRun, task: RefractionTask, wait: bool) -> None:
         """Set the refraction of the run to that with its cylinder, joined with other frames, as far as it is known.
 
-        With `wait` until all is known; `cylinder_s` grows by this time.
+        With `wait` until all is known, or until the deadline; `cylinder_s` grows by this time.
         """
         begin_s = self.clock.now_s()
-        run.refraction = task.whole() if wait else task.latest()
+        if wait:
+            task.is_done_by(None if run.deadline is None else run.deadline.later(-run.done.finish_cost.seconds))
+        run.refraction = task.latest()
         if task.is_done and task.cylinder_s > 0:
-            self._cylinder_cost.add(task.cylinder_s + task.join_s)
+            self._costs.cylinder.add(task.cylinder_s + task.join_s)
         if wait:
             run.cylinder_s += self.clock.now_s() - begin_s
 
@@ -445,7 +452,7 @@ class Reconstructor:
         for stage in _refracted(self.stages):
             stage.refocus(stage.model.stored if eye is None else self.refractor.otf(stage.model, eye), eye)
         if eye is not None:
-            self._refocus_cost.add(self.clock.now_s() - begin_s)
+            self._costs.refocus.add(self.clock.now_s() - begin_s)
 
     def _report(self, run: FrameRun, seconds: dict[str, float], check: Check | None) -> Report:
         assert run.solved is not None

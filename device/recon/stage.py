@@ -1,13 +1,14 @@
 """A stage of a reconstruction: one method at one bin, with its planned resources and its measured costs."""
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isinf
 
 import numpy as np
 
+from device.recon.durations import DurationEstimate, Pace
 from device.recon.estimation.psf_warp import Wavefront
+from device.recon.estimation.sensor_lines import EvenFrame
 from device.recon.frames import without_sensor
 from device.recon.methods import DEFAULT, Method
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -95,12 +96,15 @@ class QuickLook:
         The frame and the diagnostics.
     defects
         Flat indices of the defective pixels of each channel, None if there are none.
+    even
+        The frame without the noise of rows and columns.
     """
 
     stage: StageResult
     planes: Image
     solved: Solved
     defects: Mapping[int, Places | None]
+    even: EvenFrame
 
 
 @dataclass(frozen=True)
@@ -129,30 +133,6 @@ def default_schedule(calibration: Calibration, shape: tuple[int, int], index: in
     return Recipe("evidence", coarse), Recipe("variation", n)
 
 
-class DurationEstimate:
-    """Estimate of the duration of a step in seconds: the maximum of the last 12, some halved since."""
-
-    def __init__(self) -> None:
-        self._seen: deque[float] = deque(maxlen=12)
-
-    def add(self, seconds: float) -> None:
-        """Add the duration of one run."""
-        self._seen.append(seconds)
-
-    @property
-    def seconds(self) -> float:
-        """Maximum of the stored durations; 0.0 before the first run."""
-        return max(self._seen, default=0.0)
-
-    def halve_maximum(self) -> None:
-        """Halve the largest stored duration; called when a step was skipped because it would miss the deadline.
-
-        A skipped step records no new duration, so a single slow run would otherwise block the step forever.
-        """
-        if self._seen:
-            self._seen[self._seen.index(self.seconds)] /= 2
-
-
 class Stage:
     """Planned resources of one stage: forward model, preprocessor, solver, output arrays and cost estimates."""
 
@@ -164,6 +144,7 @@ class Stage:
         shape: tuple[int, int],
         planner: Planner,
         index: int,
+        pace: Pace,
     ) -> None:
         self.recipe = recipe
         self.is_closed_form = method.rounds == 0
@@ -175,10 +156,15 @@ class Stage:
         self.joined_preparer = Preprocessor(without_sensor(calibration), self.grid, self.solver.input_buffer)
         self.most = method.rounds if recipe.rounds is None else recipe.rounds
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
-        self.start_cost = DurationEstimate()
-        self.round_cost = DurationEstimate()
-        self.end_cost = DurationEstimate()  # of the solver, for one channel
-        self.finish_cost = DurationEstimate()  # of the picture on the sensor's grid, for all
+        self.pace = pace
+        self.forget_costs()
+
+    def forget_costs(self) -> None:
+        """Forget the durations of the steps."""
+        self.start_cost = DurationEstimate(self.pace)
+        self.round_cost = DurationEstimate(self.pace)
+        self.end_cost = DurationEstimate(self.pace)  # of the solver, for one channel
+        self.finish_cost = DurationEstimate(self.pace)  # of the picture on the sensor's grid and its report, for all
 
     def refocus(self, otf: Spectrum, eye: Wavefront | None) -> None:
         """Use `otf`, the OTF of the PSF of `eye`, from the next `solver.start` on; no-op if in use."""
@@ -201,12 +187,14 @@ class Stage:
     @property
     def reserved_s(self) -> float:
         """Estimated duration for one channel with the rounds that refraction and joining must leave time for."""
-        return self.least_s + max(min(RESERVED_ROUNDS, self.most) - 1, 0) * self.round_cost.seconds
+        return self.least_s + max(min(RESERVED_ROUNDS, self.most) - 1, 0) * self.round_cost.typical_s
 
-    def halve_costs(self) -> None:
-        """Halve the cost estimates after the stage was skipped; one slow run would otherwise block it forever."""
-        for cost in (self.start_cost, self.round_cost, self.end_cost, self.finish_cost):
-            cost.halve_maximum()
+    def skipped(self, left_s: float) -> None:
+        """Reduce the cost estimates after the stage was skipped because `left_s` seconds are too few."""
+        costs = self.start_cost, self.round_cost, self.end_cost, self.finish_cost
+        usually_fits = sum(cost.typical_s for cost in costs) <= left_s
+        for cost in costs:
+            cost.skipped(usually_fits)
 
     @property
     def shown(self) -> Image:

@@ -151,8 +151,7 @@ class AccuracyExplorer:
             log.warning("measurement of accuracy against time failed: %s", error)
             self._problem = error
         finally:
-            self._busy.release()
-            self._report("")
+            self._end()
 
     def reconstruct(self, kept: StoredCapture, recipe: Recipe) -> bytes:
         """Return the picture of a capture reconstructed by `recipe`, as PNG cropped to the illuminated field.
@@ -165,12 +164,16 @@ class AccuracyExplorer:
         try:
             made: bytes = run_in_subprocess(_reconstruct, kept, recipe, self.plans, report=self._report)
         finally:
-            self._busy.release()
+            self._end()
         return made
 
     def _acquire(self) -> None:
         if not self._busy.acquire(blocking=False):
             raise Busy("another picture or measurement is computed", "Wait until it is done.")
+
+    def _end(self) -> None:
+        self._report("")  # first: a computation that begins at once keeps its own text
+        self._busy.release()
 
     def _report(self, message: str) -> None:
         self._message = message

@@ -189,12 +189,12 @@ def _frame_files(capture: Capture, head: str, shot: ExposedCapture) -> dict[str,
 
 
 def capture_report(
-    shot: ExposedCapture, made: Report, verdict: Verdict, seen: Laterality | None, made_s: float
+    shot: ExposedCapture, made: Report, verdict: Verdict, seen: Laterality | None, made_s: float, waited_s: float
 ) -> CaptureReport:
     """Return the report of a capture, with plain numbers for numpy scalars.
 
     `made`: report of the reconstruction; `verdict`: the final one; `seen`: laterality of the picture; `made_s`: clock
-    seconds at which the picture was made.
+    seconds at which the picture was made; `waited_s`: seconds since the last read-out that other work took.
     """
     tapped_s = shot.press.tapped_s
     entries = vars(made) | vars(shot.light)
@@ -209,7 +209,7 @@ def capture_report(
         verdict=StoredVerdict(**vars(verdict)),
         laterality=None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),
         budget_s=shot.budget_s,
-        from_read_out_s=round(made_s - shot.exposure.read_out_s, 4),
+        from_read_out_s=round(made_s - shot.exposure.read_out_s - waited_s, 4),
         from_tap_s=None if tapped_s is None else round(made_s - tapped_s, 4),
         effects=shot.frame.effects,
     )

@@ -252,16 +252,16 @@ class CapturePipeline:
         return self._feedback.reassess(shot.verdict, report, shot.press.target)
 
     def record(
-        self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, made_s: float
+        self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, made_s: float, waited_s: float = 0.0
     ) -> tuple[Capture, Callable[[], dict[str, FileContent]]]:
         """Return a capture with its report and laterality estimate, and a function that returns its files by name.
 
         That function waits until the frames of the press are on the disk, or have failed to be. `made_s`: clock seconds
-        at which the picture was made.
+        at which the picture was made; `waited_s`: seconds since the last read-out that other work took.
         """
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
-        report = replace(capture_report(shot, made.report, verdict, side, made_s), device=self._origin())
+        report = replace(capture_report(shot, made.report, verdict, side, made_s, waited_s), device=self._origin())
         calibration_id = self._head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, report, {})
         colour = made.colour if isinstance(made, ColourReconstruction) else None

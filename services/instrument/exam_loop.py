@@ -249,7 +249,7 @@ class ExamLoop:
 
     def _process(self, shot: ExposedCapture) -> Capture:
         """Reconstruct, assess and store one exposure; return the stored capture."""
-        made = self._reconstruct(shot)
+        made, waited_s = self._reconstruct(shot)
         made_s = self._parts.clock.now_s()
         verdict = self._pipeline.reassess(shot, made.report)
         if verdict.code != FAILED_VERDICT.code and (verdict.word, verdict.code) != (
@@ -257,7 +257,7 @@ class ExamLoop:
             shot.verdict.code,
         ):
             self._events.verdict(shot.id, verdict)  # `make.failed` is shown with the stored capture
-        capture, files_of = self._pipeline.record(shot, made, verdict, made_s)
+        capture, files_of = self._pipeline.record(shot, made, verdict, made_s, waited_s)
         self._events.stage(shot.press, shot.id, "keep")
         target = shot.press.target
         files = files_of()
@@ -269,25 +269,30 @@ class ExamLoop:
             self._events.problem,
         )
         self._events.kept(shot.id)
-        took_s = made_s - shot.exposure.read_out_s
         text = "a picture was made in %.2f of %g s by %s"
-        log.info(text, took_s, shot.budget_s, made.report.method, extra={"about": shot.id})
+        log.info(text, capture.report.from_read_out_s, shot.budget_s, made.report.method, extra={"about": shot.id})
         self._parts.calibration_monitor.add(kept)
         return kept
 
-    def _reconstruct(self, shot: ExposedCapture) -> Reconstruction:
-        """Run the steps of a reconstruction; publish its quick look, and serve requests between its rounds."""
+    def _reconstruct(self, shot: ExposedCapture) -> tuple[Reconstruction, float]:
+        """Run the steps of a reconstruction; publish its quick look, and serve requests between its rounds.
+
+        Return the picture, and the seconds since its last read-out in which the instrument did other work.
+        """
         self._last_update_s = self._parts.clock.now_s()
+        waited_s = max(0.0, self._free_s - shot.exposure.read_out_s)
         for step in self._pipeline.reconstruct(shot, self._free_s):
             match step:
                 case StageResult(last=False):
                     self._events.quick_look(shot.press, shot.id, step.picture, shot.frame.simulated)
                 case RoundDone():
+                    begin_s = self._parts.clock.now_s()
                     self._parts.watchdog.beat()
                     self._serve_between_rounds(shot)
+                    waited_s += self._parts.clock.now_s() - begin_s
                 case Reconstruction():
                     made = step
-        return made
+        return made, waited_s
 
     def _serve_between_rounds(self, shot: ExposedCapture) -> None:
         """Expose a waiting press; else, every LIVE_S, publish the progress of `shot` and take a requested live picture.

@@ -173,7 +173,7 @@ class ShownReport(StoredRecord, DoseReport, Report):
     """Time budget of the picture in s, from the last read-out."""
 
     from_read_out_s: Number | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
-    """Seconds from the last read-out (of a resumed press, from the loaded frames) to the final picture."""
+    """Seconds from the last read-out (of a resumed press: the loaded frames) to the picture, without other work."""
 
     from_tap_s: Number | None = dataclasses.field(default=None, metadata=OMITTED_IF_EMPTY)
     """Seconds from the arrival of the request to the final picture; only if the picture is of the same run."""

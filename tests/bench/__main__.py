@@ -40,13 +40,17 @@ def main(parts: list[str]) -> None:
     wanted = parts or list(PARTS)
     print(f"{processor_name()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {platform.platform()}")
     planner = Planner(PLANS)
-    if {"speed", "deadline", "peers"} & set(wanted):
+    if {"speed", "peers"} & set(wanted):
         _on_one_scene(wanted, planner)
     if "camera" in wanted:
         camera.camera()
     if "simulator" in wanted:
         simulator.simulator()
-    for name, part in {"calibration": calibration.calibration, "fitness": fitness.fitness}.items():
+    for name, part in (
+        ("deadline", deadline.deadlines),
+        ("calibration", calibration.calibration),
+        ("fitness", fitness.fitness),
+    ):
         if name in wanted:
             part(planner)
     if "scaling" in wanted:
@@ -64,8 +68,6 @@ def _on_one_scene(wanted: list[str], planner: Planner) -> None:
         speed.rounds(scene, planner)
         speed.refraction(scene, planner)
         speed.libraries()
-    if "deadline" in wanted:
-        deadline.deadlines(scene, planner)
     if "peers" in wanted:
         peers.peers(scene, planner)
 

@@ -131,7 +131,7 @@ def test_another_head_has_no_measurement_before_its_own(explorer: AccuracyExplor
 
 
 def test_a_capture_is_reconstructed_by_another_method_and_marked_as_simulated(
-    explorer: AccuracyExplorer, spec: InstrumentSpec
+    explorer: AccuracyExplorer, spec: InstrumentSpec, messages: list[str]
 ) -> None:
     scene = simulate_exposure(spec)
     raw = raw_tiff(scene.counts, RawMetadata())
@@ -140,6 +140,7 @@ def test_a_capture_is_reconstructed_by_another_method_and_marked_as_simulated(
     picture = Image.open(BytesIO(explorer.reconstruct(kept, Recipe("gradient", 1))))
     assert picture.info["simulated"] == "true"
     assert np.asarray(picture).std() > 10
+    assert messages == ["making plans", "computing", ""]
     with pytest.raises(SettingError, match="no method guess"):
         explorer.reconstruct(kept, Recipe("guess", 1))
 

@@ -252,6 +252,7 @@ def test_a_press_suspends_a_refinement_which_resumes_to_the_same_picture(make_ri
     taken = ("expose", "expose", "quick")  # the second with the first quick look
     assert order[:7] == [*((a, stage) for stage in taken), *((b, stage) for stage in taken), (a, "keep")]
     assert first.report.rounds == second.report.rounds > 5
+    assert first.report.from_read_out_s == second.report.from_read_out_s == 0, "each waited for the other only"
     *raws, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in (*RAWS, "dark.tiff"))
     bursts = planned(rig, plans).bursts
     assert bursts is not None

@@ -1,6 +1,8 @@
 """Reconstruction of a burst of the instrument: quick look, joined frame, deadline, and a burst of one good frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -133,12 +135,12 @@ def test_a_deadline_without_time_to_join_gives_the_first_frame(bursts: BurstReco
 
 @dataclass(frozen=True)
 class ShortSteps(Deadline):
-    """Deadline that leaves time for every step of at most `longest_s`."""
+    """Deadline that leaves time for every step of at most `longest_s()`, which follows the pace of the machine."""
 
-    longest_s: float = 0.0
+    longest_s: Callable[[], float] = float
 
     def fits(self, cost_s: float) -> bool:
-        return cost_s <= self.longest_s
+        return cost_s <= self.longest_s()
 
     def later(self, delay_s: float) -> "ShortSteps":
         return self
@@ -147,10 +149,14 @@ class ShortSteps(Deadline):
 def test_as_many_frames_are_joined_as_leave_time_for_rounds(bursts: BurstReconstructor, frames: list) -> None:
     """Rounds on fewer frames are worth more than a joined frame that is not solved."""
     picture(bursts, frames)  # measures the cost of each step
-    each_s = bursts.see_cost.seconds + bursts.join_cost.seconds
-    reserved_s = bursts.single.stages[-1].reserved_s
+    costs = bursts.see_cost, bursts.join_cost
+
+    def leaves_time_for(count: int) -> float:
+        joining_s = sum(cost.seconds_of(count) + cost.typical_s / 2 for cost in costs)
+        return joining_s + bursts.single.stages[-1].reserved_s
+
     for count in (3, 1):
-        made = picture(bursts, frames, ShortSteps(SystemClock(), 0.0, (count + 0.5) * each_s + reserved_s))
+        made = picture(bursts, frames, ShortSteps(SystemClock(), 0.0, partial(leaves_time_for, count)))
         assert [use.used for use in made.report.frames] == [k < count for k in range(COUNT)]
         assert {use.reason for use in made.report.frames if not use.used} == {NO_TIME}
     assert (made.report.seconds["join"], made.report.rounds) == (0.0, bursts.single.stages[-1].most)

@@ -142,6 +142,8 @@ def test_the_report_has_the_times_from_the_last_read_out_and_from_the_tap(bench:
     for of, from_tap_s in ((shot, None), (tapped, pytest.approx(0.25 + shot.exposure.duration_s + 0.75))):
         report = bench.pipeline.record(of, made, shot.verdict, made_s)[0].report
         assert (report.from_read_out_s, report.from_tap_s) == (pytest.approx(0.75), from_tap_s)
+    report = bench.pipeline.record(shot, made, shot.verdict, made_s, waited_s=0.5)[0].report
+    assert report.from_read_out_s == pytest.approx(0.25), "as the budget counts"
 
 
 def test_the_shortest_budget_takes_one_frame_in_one_light() -> None:

@@ -11,6 +11,7 @@ import pytest
 from device.errors import FrameError
 from device.recon.burst import JoinedFrame, SeenFrame
 from device.recon.burst_reconstructor import PreparedFrame
+from device.recon.estimation.sensor_lines import EvenFrame
 from device.recon.model.preprocessing import Linear
 from device.recon.solvers.solver import Diagnostics
 from device.recon.stage import QuickLook, Recipe, Solved, StageResult
@@ -55,7 +56,9 @@ class Bench:
         self.options = options
         picture = np.full((2, 2), number, np.float32)
         solved = Solved(Linear(picture, picture, 1.0, 0.0, 0.0), Diagnostics())
-        look = QuickLook(StageResult(Recipe(), picture, last=False), picture[np.newaxis], solved, {})
+        look = QuickLook(
+            StageResult(Recipe(), picture, last=False), picture[np.newaxis], solved, {}, EvenFrame(counts, {})
+        )
         return PreparedFrame(look, SeenFrame(picture, picture > 0, picture, 1.0, 0.0))
 
     def join(

@@ -1,11 +1,12 @@
 """PSF of the picture for an eye with a cylinder: when it is used, what it gains, and what the report states."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from device.clock import Deadline, SystemClock
+from device.clock import Deadline, SystemClock, VirtualClock
 from device.recon.colour_reconstructor import psf_wavefront
 from device.recon.estimation.power_law_prior import PowerLaw, band
 from device.recon.estimation.psf_gain import PsfGain
@@ -13,10 +14,13 @@ from device.recon.estimation.psf_warp import Wavefront, transform, warped
 from device.recon.estimation.refraction.burst import FrameScatter
 from device.recon.estimation.refraction.estimator import Cylinder, NoRefraction, Refraction
 from device.recon.estimation.refraction.field import FieldEdge
+from device.recon.frame_run import EyePsf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.forward_model import Model, otf
 from device.recon.model.grid import Grid
 from device.recon.reconstructor import Reconstructor
+from device.recon.solvers.solver import Solver
+from device.recon.stage import RESERVED_ROUNDS
 from device.values import Counts, Geometry, Reconstruction
 from tests import moving_retina
 from tests.unit.test_burst import psnr_db
@@ -36,13 +40,19 @@ class KnownRefraction:
     whole_refraction: Refraction | NoRefraction
     is_done: bool = True
     has_found: bool = True
-    find_s: float = 0.0
     cylinder_s: float = 0.0
     join_s: float = 0.0
     others: list[Counts] = field(default_factory=list)
 
     def join(self, others: list[Counts]) -> None:
         self.others = others
+
+    def has_found_by(self, until: Deadline | None) -> bool:
+        return until is None or self.has_found
+
+    def is_done_by(self, until: Deadline | None) -> bool:
+        self.is_done |= until is None
+        return self.is_done
 
     def found(self) -> Refraction | NoRefraction:
         return refraction(None)
@@ -136,7 +146,7 @@ def test_predicted_gain_is_that_of_wiener_filters_on_drawn_objects() -> None:
 
 @dataclass(frozen=True)
 class NoTimeToSearch(Deadline):
-    """Deadline that leaves time for every step but the search for a refraction, which took a minute before."""
+    """Deadline that leaves time for every step but the search for a refraction, which takes a minute."""
 
     def fits(self, cost_s: float) -> bool:
         return cost_s < 60
@@ -146,12 +156,58 @@ class NoTimeToSearch(Deadline):
 def test_a_refraction_that_is_found_already_takes_no_time(counts: Counts, has_found: bool) -> None:
     planner = Planner(folder=None, effort="FFTW_ESTIMATE")
     reconstruct = Reconstructor(CALIBRATION, moving_retina.SHAPE, planner, SystemClock(), timed=False)
-    slow = KnownRefraction(refraction(None), find_s=60.0)
-    picture(reconstruct, counts, slow)  # measures it
-    known = replace(slow, has_found=has_found)
+    known = KnownRefraction(refraction(None), has_found=has_found)
     made = picture(reconstruct, counts, known, NoTimeToSearch(SystemClock(), 0.0))
     assert (made.report.psf_scale != 1) is has_found
     assert (made.report.refraction_dpt is not None) is has_found
+
+
+@dataclass
+class SlowSearch(KnownRefraction):
+    """Task that takes longer than it is waited for, and ends while the picture is made."""
+
+    clock: VirtualClock = field(default_factory=VirtualClock)
+    waits_s: list[float] = field(default_factory=list)
+
+    def has_found_by(self, until: Deadline | None) -> bool:
+        assert until is not None
+        self.waits_s.append(until.left_s())
+        self.clock.sleep(until.left_s())
+        self.has_found = True
+        return False
+
+
+class SlowRounds:
+    """Solver whose rounds take half a second on a virtual clock."""
+
+    def __init__(self, solver: Solver, clock: VirtualClock) -> None:
+        self._solver, self._clock = solver, clock
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solver, name)
+
+    def step(self) -> None:
+        self._clock.sleep(0.5)
+        self._solver.step()
+
+
+def test_a_slow_search_leaves_the_picture_its_rounds_and_reaches_the_report(counts: Counts) -> None:
+    clock = VirtualClock()
+    planner = Planner(folder=None, effort="FFTW_ESTIMATE")
+    reconstruct = Reconstructor(CALIBRATION, moving_retina.SHAPE, planner, clock, timed=False)
+    stage = reconstruct.stages[-1]
+    stage.solver = SlowRounds(stage.solver, clock)
+    *_, stored = reconstruct.steps(counts, simulated=True, rounds=ROUNDS, eye_psf=EyePsf.STORED)  # measures the rounds
+    assert isinstance(stored, Reconstruction)
+    begin_s = clock.now_s()
+    slow = SlowSearch(refraction(None), has_found=False, clock=clock)
+    made = picture(reconstruct, counts, slow, Deadline.after(clock, 10.0))
+    assert slow.waits_s == [pytest.approx(10 - RESERVED_ROUNDS * 0.5)]
+    assert (made.report.bin, made.report.rounds) == (stage.recipe.bin, RESERVED_ROUNDS)
+    assert made.report.psf_scale == 1, "the stored PSF"
+    assert made.report.refraction_dpt is not None
+    assert clock.now_s() - begin_s <= 10
+    assert np.array_equal(made.picture, stored.picture)
 
 
 def test_a_deadline_does_not_wait_for_the_cylinder(reconstruct: Reconstructor, counts: Counts) -> None:

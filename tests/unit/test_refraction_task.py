@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from device.clock import SystemClock
+from device.clock import Deadline, SystemClock, VirtualClock
 from device.recon.estimation.refraction.estimator import NoRefraction, Refraction
 from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.task import RefractionTask
@@ -85,6 +85,27 @@ def test_a_refused_frame_and_a_task_without_cylinder_search_for_none() -> None:
     assert isinstance(begin(estimator, lock, 0.0).whole(), NoRefraction)
     assert isinstance(begin(estimator, lock, 2.0, with_cylinder=False).whole(), Refraction)
     assert [name for name, _ in estimator.calls] == ["find", "find"]
+
+
+class RunningClock(VirtualClock):
+    """Virtual clock in which every reading takes a second."""
+
+    def now_s(self) -> float:
+        self.elapsed_s += 1
+        return self.elapsed_s
+
+
+def test_a_wait_ends_with_its_deadline_and_the_search_goes_on() -> None:
+    estimator, took_s = Estimator(), list[float]()
+    frame = np.full((2, 2), 2.0, np.float32), None, None
+    task = RefractionTask(estimator, Lock(), RunningClock(), frame, True, took_s.append)  # type: ignore[arg-type]
+    for ends_in_time in (task.has_found_by, task.is_done_by):
+        assert not ends_in_time(Deadline.after(RunningClock(), 5))
+    assert took_s == []
+    estimator.go.set()
+    assert task.is_done_by(None)
+    assert task.has_found_by(Deadline(RunningClock(), 0.0)), "it is there"
+    assert took_s == [1.0]
 
 
 def test_an_unexpected_error_reaches_who_asks_and_does_not_block_the_next_task() -> None:

@@ -1,6 +1,6 @@
 """Interface of a solver, and the figures that it reports: all that a method of one's own has to provide."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -34,8 +34,9 @@ class Diagnostics:
         Parts of the frame that no object explains; None: none, or not searched for.
     unevenness
         Smooth part of the residual in units of its noise; None if it is unknown.
-    uneven
-        What may be uneven in the light of the frame, the most probable first; empty: nothing, or not searched for.
+    find_uneven
+        Search for what may be uneven in the light of the frame, the most probable first, also after the next frame;
+        None: nothing is uneven.
     """
 
     noise_dn: float | None = None
@@ -44,7 +45,7 @@ class Diagnostics:
     quality: Figures = field(default_factory=dict)
     spots: Spots | None = None
     unevenness: float | None = None
-    uneven: Sequence[UnevenLight] = ()
+    find_uneven: Callable[[], Sequence[UnevenLight]] | None = None
 
 
 class Solver(Protocol):

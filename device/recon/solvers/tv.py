@@ -10,6 +10,7 @@ residual: eight rounds then reach what a hundred reach from zero.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from math import isfinite
 
 import numpy as np
@@ -129,7 +130,7 @@ class EvidenceWiener:
             residual=known.residual if added.residual is None else added.residual,
             spots=known.spots if added.spots is None else added.spots,
             unevenness=known.unevenness if added.unevenness is None else added.unevenness,
-            uneven=added.uneven or known.uneven,
+            find_uneven=added.find_uneven or known.find_uneven,
             regularisation={**known.regularisation, **added.regularisation},
             quality={**known.quality, **added.quality},
         )
@@ -316,8 +317,8 @@ class TotalVariation(EvidenceWiener):
         """Write the picture to `out` (grid, float32), and its misfit to `diagnostics`.
 
         `residual` is the rms residual in units of the noise. With a known field the quality figures also
-        have `coverage` and the flicker figure `banding`, and `spots` and `uneven` light are searched for if more than
-        noise is left.
+        have `coverage` and the flicker figure `banding`, and if more than noise is left, `spots` are searched for, and
+        uneven light can be.
         """
         super().finish(out)
         noise = self.detail.noise
@@ -333,8 +334,10 @@ class TotalVariation(EvidenceWiener):
             uneven = unevenness(left, seen, noise)
             self._add_diagnostics(Diagnostics(unevenness=uneven))
             if uneven > MIN_UNEVENNESS:
-                frame = Linear(self._y + self.stray, self._good, light_dn, 0.0, 0.0)
-                self._add_diagnostics(Diagnostics(uneven=find_uneven_light(frame, self.shading.blurred)))
+                frame = Linear(self._y + self.stray, self._good.copy(), light_dn, 0.0, 0.0)
+                self._add_diagnostics(
+                    Diagnostics(find_uneven=partial(find_uneven_light, frame, self.shading.blurred))
+                )  # the picture does not wait for the search
             if residual > MAX_NOISE:
                 variance_dn2 = noise.per_dn * np.maximum(seen, 0) + noise.floor_dn2
                 left /= np.sqrt(np.maximum(variance_dn2, 1e-9))
