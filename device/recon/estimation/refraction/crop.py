@@ -36,7 +36,7 @@ NOISE_DRAWS = 2  # for the bias by noise: their scatter adds 3 % to the sd
 SETTLED_SDS = 0.2
 MAX_MISFIT = 1.2
 LARGEST_STEP_DPT = 0.7
-MAX_RIM_SD = 15.0  # clean frames up to 9, pupils that hide 2 % at 500 electrons from 34 on
+MAX_RIM_SD = 18.0  # clean frames up to 9, pupils that hide 2 % at 500 electrons from 34 on
 
 Floats = NDArray[np.float64]
 
