@@ -6,9 +6,10 @@ only if its measured cost fits into the time that is left.
 """
 
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import replace
+from functools import partial
 from math import isfinite
 from threading import Lock
 
@@ -28,7 +29,7 @@ from device.recon.assessment.quality_figures import (
     psf_match,
     quality_warnings,
 )
-from device.recon.corrections import Corrections
+from device.recon.corrections import BehindPupil, Corrections
 from device.recon.durations import LEAST_RUNS, Pace, RefractionCosts
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.flicker import FlickerFinder
@@ -142,10 +143,16 @@ class Reconstructor:
                 for recipe in recipes
             ]
             self.defects = DefectFinder(calibration, shape, psf_index)
-        self.corrections = Corrections(calibration, shape, self.defects.dark, self._solve, pace)
         self.lines = LineFinder(self.defects.dark, calibration.sensor.white_dn, calibration.psfs[psf_index])
         self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
+
+        def replan(other: Calibration) -> Reconstructor:
+            rest = recipes, psf_index, True, None, False, methods, audience, field_fixed
+            return Reconstructor(other, shape, planner, clock, *rest)
+
+        behind = None if self.refractor is None else partial(_solve_behind_pupil, self, replan)
+        self.corrections = Corrections(calibration, shape, self.defects.dark, self._solve, behind, pace)
         self._costs = RefractionCosts(pace)
         self._gain = None if self.refractor is None else PsfGain(self.stages[-1].model)
         if timed:
@@ -510,6 +517,23 @@ class Reconstructor:
             other = self.refractor.otf(stage.model, Wavefront(eye.m_dpt))
             gain_db = self._gain(stage.model.otf, other, PowerLaw(log_power, slope), noise_dn)
         return {"j0_dpt": -eye.j0_dpt, "j45_dpt": eye.j45_dpt, "gain_db": gain_db}
+
+
+def _solve_behind_pupil(
+    owner: Reconstructor, replan: Callable[[Calibration], Reconstructor], run: FrameRun
+) -> Generator[Step, None, BehindPupil | None]:
+    """Yield the steps of the frame of a run behind its pupil, and return run and picture; None if none is found."""
+    assert owner.refractor is not None
+    with owner._refraction_lock:
+        pupil = owner.refractor.find_pupil(*run.brightest())
+    if pupil is None:
+        return None
+    psfs = list(owner.calibration.psfs)
+    psfs[owner.psf_index], hidden = pupil.hide(psfs[owner.psf_index], owner.refractor.geometry.pitch_um)
+    other = replan(replace(owner.calibration, psfs=tuple(psfs)))
+    again = FrameRun(other.stages[0], other.defects, other.clock, run.asked, run.counts, None, run.deadline)
+    made = yield from other._solve(again)
+    return BehindPupil(again, made, hidden)
 
 
 def _reported_refraction(

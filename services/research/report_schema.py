@@ -95,6 +95,7 @@ QUALITY: Mapping[str, str] = {
         "Falloff of the light over the sensor, beside the flat frame's, that was evened out; absent without any."
     ),
     "leak": "Share of light that is no image, near a corner, that was taken out of the frame; absent without any.",
+    "pupil": "Share of the PSF's light that the pupil hides, with which the picture was made; absent without any.",
     "banding": (
         "Rms of the row means of the residual as a share of the light; above 0.0013 the light flickered. Of a closed "
         "form: rms of the periodic gain of the rows, absent without flicker."

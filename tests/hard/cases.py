@@ -48,6 +48,9 @@ UNEVEN = {
     "evidence": "A closed form has no residual, and on a sensor that the disc fills only its edge shows the gradient.",
     "tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure.",
 }
+CUT_PUPIL = dict.fromkeys(
+    ("tikhonov", "gradient", "evidence"), "A closed form has no residual, and is not solved again behind the pupil."
+)
 PATTERN = dict.fromkeys(
     ("tikhonov", "gradient", "evidence"),
     "A closed form takes gain and offset of each pixel as calibrated, not as seen.",
@@ -125,7 +128,7 @@ def bands(share: float) -> Build:
 
 
 def changed(**keys: float) -> Build:
-    """Return the builder of a frame with other values of the scene's flaws, `light__KEY` and `sensor__KEY`."""
+    """Return the builder of a frame with other values of the scene, `eye__KEY`, `light__KEY` and `sensor__KEY`."""
     return lambda eye: eye.frame({f"sim.{key.replace('__', '.')}": value for key, value in keys.items()})
 
 
@@ -339,6 +342,19 @@ CASES: tuple[Case, ...] = (
         lambda eye: eye.clean.with_raw(defects.leak(eye.clean.raw, eye.spec.camera, 0.5)),
         "leak misfit",
         NO_RESIDUAL,
+    ),
+    *(
+        _case(
+            name,
+            "light",
+            changed(eye__pupil_um=pupil_um, eye__decentred_um=off_um),
+            "pupil",
+            CUT_PUPIL,
+        )
+        for name, pupil_um, off_um in (
+            ("cut pupil 18 %", 7700.0, 3260.0),
+            ("small pupil off centre", 4000.0, 900.0),
+        )
     ),
     _case("dust", "light", changed(sensor__dust_spots=14), "spots", NO_RESIDUAL),
     _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit leak", UNEVEN),

@@ -1,7 +1,9 @@
 """Frames of one eye behind a head's diffuser, with what a head or a lamp adds to them, and their solver."""
 
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -25,9 +27,17 @@ from tests.simulated import coarse
 class Exposed:
     """Frames of one drawn eye, or of a photograph, behind a head's diffuser, and its solvers."""
 
-    def __init__(self, head: str, m_dpt: float, peak_e: float, photo: Path | None = None, frames: int = 1) -> None:
+    def __init__(
+        self,
+        head: str,
+        m_dpt: float,
+        peak_e: float,
+        photo: Path | None = None,
+        frames: int = 1,
+        more: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
         changes = {"camera.backend": "sim", "light.backend": "sim", "sim.peak_e": peak_e, "sim.seed": 5}
-        changes |= {"sim.eye.m_dpt": m_dpt}
+        changes |= {"sim.eye.m_dpt": m_dpt, **more}
         if photo is not None:
             changes |= {"sim.object.kind": "image", "sim.object.image": str(photo)}
         self.spec = coarse(with_changes(load_head(resources.HEADS / f"{head}.toml"), changes), 2)

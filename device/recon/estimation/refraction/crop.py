@@ -23,6 +23,7 @@ from device.recon.estimation.refraction.burst import BurstFrame, frame_steps
 from device.recon.estimation.refraction.crop_model import COVARIANCE_ITERATIONS, CropModel, Fit
 from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.field import FieldEdge
+from device.recon.estimation.refraction.pupil import dark_rim
 from device.recon.model.fft_plans import Planner
 
 MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
@@ -35,6 +36,7 @@ NOISE_DRAWS = 2  # for the bias by noise: their scatter adds 3 % to the sd
 SETTLED_SDS = 0.2
 MAX_MISFIT = 1.2
 LARGEST_STEP_DPT = 0.7
+MAX_RIM_SD = 18.0  # clean frames up to 9, pupils that hide 2 % at 500 electrons from 34 on
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +46,7 @@ class Refined:
     """Eye (M, J0, J45) in dpt as wavefront, and the misfit; `covariance` is (D' K^-1 D)^-1 of the first step, dpt^2.
 
     `misfit` is the squared residual over its noise per sample: 0.4 to 0.8 where the model explains the frame.
-    `bias_dpt` is what b adds to a step; 0 where b is not computed.
+    `bias_dpt` is what b adds to a step; 0 where b is not computed. `rim_sd` is `pupil.dark_rim` of the last fit.
     """
 
     eye_dpt: Floats
@@ -52,11 +54,17 @@ class Refined:
     bias_dpt: Floats
     misfit: float
     has_settled: bool
+    rim_sd: float
 
     @property
     def is_explained(self) -> bool:
         """True if the model explains the frame."""
         return self.misfit < MAX_MISFIT
+
+    @property
+    def is_whole(self) -> bool:
+        """True if the light of the frame comes through the whole PSF."""
+        return self.rim_sd < MAX_RIM_SD
 
     @property
     def sds_dpt(self) -> Floats:
@@ -69,7 +77,7 @@ class CropRefinement:
     """Refinement of the eyes that an `EdgeLikelihood` has found, on the same grid, for a PSF with this radius."""
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
-        self._edges = edges
+        self._edges, self._psf_radius_px = edges, psf_radius_px
         self._model = CropModel(edges, planner, psf_radius_px)
 
     def steps(self, eye_dpt: Floats, edge: FieldEdge, frames: Sequence[BurstFrame]) -> Floats:
@@ -106,7 +114,8 @@ class CropRefinement:
             if has_settled:
                 break
         self._edges.fit_smooth(eye_dpt)
-        return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled)
+        rim_sd = dark_rim(self._edges, eye_dpt, fit, self._psf_radius_px)
+        return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled, rim_sd)
 
     def _score_of_noise(self, fit: Fit) -> Floats:
         """Return the mean score (3,) that the sensor's noise adds to that of the expected frame of a fit.

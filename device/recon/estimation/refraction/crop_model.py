@@ -90,17 +90,19 @@ class Weighting:
 class Fit:
     """Fit of one frame for one eye: whitened spectrum of the detail, K^-1 times the residual, expected frame, and D.
 
-    `derivatives` (D) are those of the expected frame with respect to M, J0 and J45.
+    `object` is the spectrum of smooth part and detail, `derivatives` (D) are those of the expected frame with respect
+    to M, J0 and J45.
     """
 
     detail: Spectrum
+    object: Spectrum
     weighted: Image
     expected: Image
     derivatives: list[Image]
 
     @property
     def score(self) -> Floats:
-        """D' K^-1 times the residual, (3,)."""
+        """D' K^-1 times the residual, one value for each derivative."""
         return np.array([np.vdot(part, self.weighted) for part in self.derivatives], np.float64)
 
 
@@ -134,12 +136,16 @@ class CropModel:
         self._set_prior(eye_dpt)
 
     def focus(self, eye_dpt: Floats) -> None:
-        """Set OTF and preconditioner to an eye."""
-        likelihood = self._edges.likelihood
+        """Set OTF, its derivatives and the preconditioner to an eye."""
+        likelihood, grid = self._edges.likelihood, self._grid
         stretch = transform(likelihood.geometry, *eye_dpt)
-        likelihood.interpolated_otf.on_grid(self._grid.shape, self._grid.n, stretch, self._otf)
-        power = np.abs(self._otf) ** 2 * self._root**2
-        self._slopes = [self._slope(eye_dpt, axis) for axis in np.eye(3) * DERIVATIVE_STEP_DPT]
+        likelihood.interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
+        self._focus_on(self._otf, [_slope(self._edges, eye_dpt, step) for step in np.eye(3) * DERIVATIVE_STEP_DPT])
+
+    def _focus_on(self, otf: Spectrum, slopes: list[Spectrum]) -> None:
+        """Set the OTF, its derivatives, and the preconditioner."""
+        self._otf, self._slopes = otf, slopes
+        power = np.abs(otf) ** 2 * self._root**2
         self._preconditioner = (1 / (1 + self._mean_weight * power)).astype(np.float32)
 
     def fit(self, light: Image, start: Spectrum | None, most: int = MAX_ITERATIONS) -> Fit:
@@ -148,7 +154,7 @@ class CropModel:
         seen = self._seen(self._spectrum(smooth))
         detail, weighted, fitted = self._solve((light - seen).astype(np.float32), start, most)
         spectrum = self._spectrum(smooth + self._object(detail))
-        return Fit(detail, weighted, seen + fitted, [self._seen(spectrum, slope) for slope in self._slopes])
+        return Fit(detail, spectrum, weighted, seen + fitted, [self._seen(spectrum, slope) for slope in self._slopes])
 
     def misfit(self, light: Image, fit: Fit) -> float:
         """Return the squared residual of a frame over its noise, per sample that is used."""
@@ -175,17 +181,6 @@ class CropModel:
         within = np.clip((np.float32(reach) - radius) / 2, 0, 1).astype(np.float32)
         self._reach = within / np.float32(self._grid.size)  # with the scale of an inverse FFT
         self._mean_weight = float(self._weighting.weights.mean()) * min(seen, 1.0)
-
-    def _slope(self, eye_dpt: Floats, step_dpt: Floats) -> Spectrum:
-        """Return the derivative of the OTF with respect to the eye along a small step, per dpt."""
-        likelihood = self._edges.likelihood
-        above, below = (
-            likelihood.interpolated_otf.on_grid(
-                self._grid.shape, self._grid.n, transform(likelihood.geometry, *(eye_dpt + sign * step_dpt))
-            )
-            for sign in (1, -1)
-        )
-        return np.asarray((above - below) / np.float32(2 * DERIVATIVE_STEP_DPT), np.complex64)
 
     def _spectrum(self, image: Image) -> Spectrum:
         self._fft.space[:] = image
@@ -249,6 +244,18 @@ class CropModel:
             fitted += np.float32(factor) * seen
             ratio = size / before
         return detail, self._weighting(frame - fitted), fitted
+
+
+def _slope(edges: EdgeLikelihood, eye_dpt: Floats, step_dpt: Floats) -> Spectrum:
+    """Return the derivative of the OTF with respect to the eye along a small step, per dpt."""
+    likelihood, grid = edges.likelihood, edges.grid
+    above, below = (
+        likelihood.interpolated_otf.on_grid(
+            grid.shape, grid.n, transform(likelihood.geometry, *(eye_dpt + sign * step_dpt))
+        )
+        for sign in (1, -1)
+    )
+    return np.asarray((above - below) / np.float32(2 * DERIVATIVE_STEP_DPT), np.complex64)
 
 
 def seen_share(grid: Grid, edge: Edge, psf_samples: float) -> float:

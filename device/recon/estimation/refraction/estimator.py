@@ -30,6 +30,7 @@ from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.likelihood import RefractionLikelihood
 from device.recon.estimation.refraction.lit_disc import seen_disc
+from device.recon.estimation.refraction.pupil import Pupil, PupilFinder
 from device.recon.estimation.refraction.uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
@@ -55,6 +56,7 @@ MAX_SD_DPT = 1.5
 MAX_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MAX_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
+CUT = "part of the diffuser is dark, as behind a pupil that is small or off the axis"
 MIN_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains -0.02 to 0.15 dB, and as |J|^2
 
 Floats = NDArray[np.float64]
@@ -129,10 +131,13 @@ class NoRefraction:
         Reason, a sentence without a full stop.
     is_far
         True: the frame is explained best at the end of +-SPAN_DPT, by a far eye or another PSF.
+    is_cut
+        True: light is missing from the rim of the PSF, as behind a pupil that hides part of the diffuser.
     """
 
     reason: str
     is_far: bool = False
+    is_cut: bool = False
 
 
 def can_estimate_refraction(calibration: Calibration) -> bool:
@@ -176,7 +181,7 @@ class RefractionEstimator:
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
         self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
-        self._psf_samples = reach_px / self._edges.grid.n
+        self._reach_px = reach_px
         self._refinement = CropRefinement(self._edges, planner, reach_px)
         lever = bands.high / self._edges.grid.n * 2 * reach_px * geometry.scale_per_dpt
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
@@ -302,6 +307,27 @@ class RefractionEstimator:
             scatter=scatter,
         )
 
+    def find_pupil(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Pupil | None:
+        """Find the pupil that explains a frame.
+
+        Parameters
+        ----------
+        counts
+            Counts, uint16 or float32 (rows, cols).
+        dark
+            Dark frame of the same shape; None: that of the calibration.
+        defects
+            Flat indices of defective pixels, which are left out.
+
+        Returns
+        -------
+        Pupil or None
+            None if no pupil explains the frame better than the whole PSF.
+        """
+        found = self.find(counts, dark, defects)
+        m_dpt = found.m_dpt if isinstance(found, Refraction) else 0.0
+        return PupilFinder(self._edges, self._planner, self._reach_px)(counts, dark, defects, m_dpt)
+
     @property
     def _is_refined(self) -> bool:
         """True if the samples are fine enough for the refinement."""
@@ -317,6 +343,8 @@ class RefractionEstimator:
         eye_dpt = model.minimum
         if self._is_refined:
             refined = self._refinement(eye_dpt)
+            if not refined.is_whole:
+                return NoRefraction(CUT, is_cut=True)
             if not refined.has_settled:
                 return NoRefraction("the refinement of the refraction does not converge")
             if not refined.is_explained:
@@ -352,7 +380,7 @@ class RefractionEstimator:
         edges.fit_smooth(np.array([m_dpt]))
         seen_dpt = self._descend(m_dpt, self.step_dpt / 2)
         found_dpt, _ = self._alternate(seen_dpt, MAX_ROUNDS)
-        by_crop_dpt = CROPPED_SD_DPT if seen_share(edges.grid, edges.edge, self._psf_samples) < 1 else 0.0
+        by_crop_dpt = CROPPED_SD_DPT if seen_share(edges.grid, edges.edge, self._reach_px / edges.grid.n) < 1 else 0.0
         return found_dpt, float(np.hypot(found_dpt - seen_dpt, by_crop_dpt))
 
     def _alternate(self, m_dpt: float, most: int) -> tuple[float, float]:

@@ -10,6 +10,7 @@ Power vector after Thibos, Wheeler and Horner (1997), with a minus cylinder C on
 """
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from device.recon.estimation.refraction.estimator import NoRefraction, Refraction
@@ -75,6 +76,17 @@ def report_of(found: Refraction | NoRefraction, zero: RefractionZero = "relative
             "axis_deg": lens.axis_deg,
         }
     return report
+
+
+def widened(
+    refraction_dpt: Mapping[str, float | str | None] | None, more_sd_dpt: float
+) -> dict[str, float | str | None] | None:
+    """Return `refraction_dpt` of a report with one more standard deviation in those of M, J0 and J45."""
+    if refraction_dpt is None:
+        return None
+    sds = ((key, refraction_dpt[key]) for key in ("sd", "j0_sd", "j45_sd"))
+    more = {key: math.hypot(sd, more_sd_dpt) for key, sd in sds if isinstance(sd, float)}
+    return {**refraction_dpt, **more}
 
 
 def scatter_of(found: Refraction | NoRefraction | None) -> dict[str, float] | None:
