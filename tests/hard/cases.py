@@ -315,7 +315,7 @@ CASES: tuple[Case, ...] = (
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
-    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step), "", PATTERN) for step in (0.01, 0.03)),
+    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step), "step") for step in (0.01, 0.03)),
     _case(
         "reflex, not clipped",
         "light",

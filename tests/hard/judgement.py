@@ -38,6 +38,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("misfit", ("does not explain",)),
     ("spots", ("dark spots", "spots on")),
     ("falloff", ("falls off",)),
+    ("step", ("gain of the sensor changes",)),
     ("leak", ("leak of light",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
