@@ -341,6 +341,7 @@ CASES: tuple[Case, ...] = (
         NO_RESIDUAL,
     ),
     _case("dust", "light", changed(sensor__dust_spots=14), "spots", NO_RESIDUAL),
+    *(_case(f"ghost {share:.0%}", "light", changed(light__ghost=share), "ghost", NO_RESIDUAL) for share in (0.1, 0.3)),
     _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit leak", UNEVEN),
     _case("column noise, 16 e-", "rows and columns", columns(16.0), "", PATTERN),
     *(

@@ -28,6 +28,7 @@ BETTER: Mapping[str, int] = {  # 1: larger is better, -1: smaller
     "resolution_um": -1,
 }
 KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
+    ("ghost", ("second image",)),
     ("far", ("is beyond 10 dpt",)),
     ("refraction", ("refraction",)),
     ("signal", ("no signal",)),

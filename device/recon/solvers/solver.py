@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from device.recon.estimation.ghost import Ghost, GhostTrace
 from device.recon.estimation.spots import Spots
 from device.recon.estimation.uneven_light import UnevenLight
 from device.recon.model.preprocessing import Linear
@@ -36,6 +37,10 @@ class Diagnostics:
         Smooth part of the residual in units of its noise; None if it is unknown.
     uneven
         What may be uneven in the light of the frame, the most probable first; empty: nothing, or not searched for.
+    ghost_trace
+        What the residual shows of a displaced second image; None if it is unknown.
+    ghost
+        A displaced second image; None: none, or not searched for.
     """
 
     noise_dn: float | None = None
@@ -45,6 +50,8 @@ class Diagnostics:
     spots: Spots | None = None
     unevenness: float | None = None
     uneven: Sequence[UnevenLight] = ()
+    ghost_trace: GhostTrace | None = None
+    ghost: Ghost | None = None
 
 
 class Solver(Protocol):
