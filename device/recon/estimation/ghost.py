@@ -4,6 +4,7 @@ Its object reaches beyond the field on one side, where the forward model has non
 residual, deconvolved, therefore looks like the displaced object outside the field, for one displacement.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -151,6 +152,7 @@ def ghost_trace(left: Image, picture: Image, model: Model, n: int) -> GhostTrace
     return GhostTrace(np.asarray(both / np.maximum(own, 1e-30), np.float32), np.asarray(score, np.float32), n)
 
 
+@lru_cache(maxsize=4)
 def _outside(grid: Grid, shape: tuple[int, int], n: int) -> Image:
     """Return 1 in the ring around the field in which light of a ghost may be, else 0, from the window's corner on."""
     radius = grid.radius_samples / n
