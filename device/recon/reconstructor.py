@@ -29,7 +29,7 @@ from device.recon.assessment.quality_figures import (
     psf_match,
     quality_warnings,
 )
-from device.recon.corrections import BehindPupil, Corrections
+from device.recon.corrections import BehindPupil, Corrections, with_corrections
 from device.recon.durations import LEAST_RUNS, Pace, RefractionCosts
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.flicker import FlickerFinder
@@ -273,12 +273,12 @@ class Reconstructor:
             The frame has another shape than the sensor, too many pixels are missing (`Preprocessor`), or rows are
             repeated or missing (`RowOrder`).
         """
-        counts, noise = self.lines(checked(counts, self.shape), dark) if look is None else look.even
+        counts, faults, notes = self.lines(checked(counts, self.shape), dark) if look is None else look.even
         asked = Asked(dark, simulated, rounds, quick, eye_psf)
         run = FrameRun(self.stages[0], self.defects, self.clock, asked, counts, joined, deadline)
         made = yield from self._solve(run, Known(refraction, others, look))
         made = yield from self.corrections(run, made)
-        yield replace(made, report=replace(made.report, quality=made.report.quality | noise)) if noise else made
+        yield with_corrections(made, faults, notes, others_s=0.0)
 
     def _solve(self, run: FrameRun, known: Known = NOTHING) -> Generator[Step, None, Reconstruction]:
         """Yield the steps before the picture, and return the picture."""

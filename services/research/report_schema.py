@@ -90,6 +90,8 @@ QUALITY: Mapping[str, str] = {
     "flicker": "Rms of the gains of the rows, minus 1, that were taken out of the frame; absent without flicker.",
     "column_noise_dn": "Rms of the noise of the columns that was taken out of the frame, in DN; absent without it.",
     "row_noise_dn": "Rms of the noise of the rows that was taken out of the frame, in DN; absent without it.",
+    "ghost": "Light of a second, displaced image over that of the first that was taken out; absent without one.",
+    "gain_step": "Step of the gain between columns of the sensor that was taken out; absent without one.",
     "spots": "Share of the frame that no object explains (dust, reflexes) and that was left out; absent without any.",
     "falloff": (
         "Falloff of the light over the sensor, beside the flat frame's, that was evened out; absent without any."

@@ -318,7 +318,7 @@ CASES: tuple[Case, ...] = (
     *(_case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED) for deg in (0.5, 1.5)),
     *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     *(_case(f"LED bands {100 * share:g} %", "light", bands(share), "misfit", BANDS) for share in (0.015, 0.05)),
-    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step), "", PATTERN) for step in (0.01, 0.03)),
+    *(_case(f"gain step {step:.0%}", "sensor", changed(sensor__gain_step=step), "step") for step in (0.01, 0.03)),
     _case(
         "reflex, not clipped",
         "light",
@@ -357,6 +357,7 @@ CASES: tuple[Case, ...] = (
         )
     ),
     _case("dust", "light", changed(sensor__dust_spots=14), "spots", NO_RESIDUAL),
+    *(_case(f"ghost {share:.0%}", "light", changed(light__ghost=share), "ghost", NO_RESIDUAL) for share in (0.1, 0.3)),
     _case("stray gradient 30 %", "light", changed(light__stray_gradient=0.3), "eye bright misfit leak", UNEVEN),
     _case("column noise, 16 e-", "rows and columns", columns(16.0), "", PATTERN),
     *(

@@ -29,6 +29,7 @@ BETTER: Mapping[str, int] = {  # 1: larger is better, -1: smaller
 }
 KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("pupil", ("pupil hides",)),
+    ("ghost", ("second image",)),
     ("far", ("is beyond 10 dpt",)),
     ("refraction", ("refraction",)),
     ("signal", ("no signal",)),
@@ -39,6 +40,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first match applies
     ("misfit", ("does not explain",)),
     ("spots", ("dark spots", "spots on")),
     ("falloff", ("falls off",)),
+    ("step", ("gain of the sensor changes",)),
     ("leak", ("leak of light",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),

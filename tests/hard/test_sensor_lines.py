@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from device.errors import FrameError
@@ -12,7 +13,8 @@ from tests import scenes
 from tests.hard import defects
 from tests.hard.exposed import Exposed, exposed
 
-LOST = 0.02  # PCC
+LOST, STEP_LOST = 0.02, 0.005  # PCC
+REFRACTION_DPT = 0.15  # the standard deviation of these frames is about 0.05
 PEAK_E = 1000.0  # noise of lines exceeds that of dim pixels only
 
 
@@ -45,3 +47,24 @@ def test_a_burst_leaves_out_a_frame_with_repeated_rows(index: int) -> None:
     assert isinstance(made, Reconstruction)
     assert [use.used for use in made.report.frames] == [k != index for k in range(4)]
     assert "repeat" in (made.report.frames[index].reason or "")
+
+
+@pytest.mark.parametrize("head", ["sim", "imx296"])
+@pytest.mark.parametrize(("m_dpt", "peak_e"), [(0.0, 8000.0), (-4.0, 8000.0), (3.0, 500.0)])
+def test_a_gain_step_costs_neither_picture_nor_refraction_and_is_reported(
+    head: str, m_dpt: float, peak_e: float
+) -> None:
+    eye = exposed(head, m_dpt, peak_e)
+    clean = eye.make(eye.frames[0])
+    assert "gain_step" not in clean.report.quality
+    assert clean.report.refraction_dpt is not None
+    columns = np.arange(eye.spec.camera.cols)
+    for at, share in ((0.5, 0.03), (0.35, -0.05)):
+        gain = np.where(columns < round(at * len(columns)), 1, np.float32(1 + share))
+        made = eye.make(eye.under(gain, np.zeros_like(gain)))
+        assert eye.pcc(made) > eye.pcc(clean) - STEP_LOST
+        assert made.report.quality["gain_step"] == pytest.approx(abs(share), abs=0.004)
+        assert [words for words in made.report.warnings if f"at column {round(at * len(columns))}" in words]
+        assert made.report.refraction_dpt is not None
+        clean_dpt = clean.report.refraction_dpt["sphere"]
+        assert made.report.refraction_dpt["sphere"] == pytest.approx(clean_dpt, abs=REFRACTION_DPT)

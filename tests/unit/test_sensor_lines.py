@@ -59,6 +59,16 @@ def test_an_offset_of_lines_is_taken_out(scene: str, axis: int, spread_dn: float
     assert left.std() < 0.65 * spread_dn  # the slow part cannot be distinguished from the scene
 
 
+@pytest.mark.parametrize("lit", [LIT, np.ones_like(LIT)])
+@settings(max_examples=20)
+@given(share=st.floats(0.02, 0.1), column=st.integers(120, 280), sign=st.sampled_from([-1, 1]))
+def test_a_gain_step_is_taken_out_and_reported(lit: Image, share: float, column: int, sign: int) -> None:
+    gain = np.where(np.arange(SHAPE[1]) < column, 1, 1 + sign * share)
+    found = FINDER(counts(800 * smooth(1, 20) * lit * gain.astype(np.float32)))
+    assert found.figures["gain_step"] == pytest.approx(share, abs=0.01)
+    assert f"at column {column}" in found.notes[0]
+
+
 @pytest.mark.parametrize("scene", ["disc", "full"])
 def test_a_gain_of_lines_is_taken_out(scene: str) -> None:
     gain = 1 + 0.02 * np.random.default_rng(5).standard_normal(SHAPE[1])

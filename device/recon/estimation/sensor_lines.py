@@ -1,15 +1,15 @@
-"""Faults of the rows and columns of a sensor in one frame: rows out of order, noise of rows and of columns.
+"""Faults of the rows and columns of a sensor in one frame: rows out of order, noise of rows and columns, a gain step.
 
-Both are measured in one pass over the counts. NUMERICS.md 6.3.
+All are measured in one pass over the counts. NUMERICS.md 6.3 to 6.5.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
+from device.recon.estimation.gain_step import find_gain_step
 from device.recon.estimation.line_noise import BANDS, LineNoise, line_noise
-from device.recon.estimation.row_order import MAX_REPEATED, SEGMENTS, RowOrder
+from device.recon.estimation.row_order import MAX_REPEATED, MIN_LIGHT, MIN_SPREAD, SEGMENTS, RowOrder
 from device.recon.model import kernels
 from device.recon.model.compiled import read_only
 from device.recon.model.kernels import Pixels
@@ -63,10 +63,13 @@ def _contiguous(counts: Pixels) -> Pixels:
 
 
 class EvenFrame(NamedTuple):
-    """Counts without the noise of rows and columns, and the rms of what was taken out by names in a report, in DN."""
+    """Counts without the faults of rows and columns, the sizes of what was taken out by names in a report (rms of noise
+    in DN, share of a gain step), and notes for the report.
+    """
 
     counts: Pixels
     figures: dict[str, float]
+    notes: tuple[str, ...] = ()
 
 
 class LineFinder:
@@ -78,10 +81,14 @@ class LineFinder:
     def __init__(self, dark: Image, white_dn: float, psf: Psf) -> None:
         self._dark, self._white_dn = dark, white_dn
         self._dark_lines = lines_of(dark)
-        self._order = RowOrder(lines_of(psf.pixels).bins)
+        seen = lines_of(psf.pixels)
+        self._order = RowOrder(seen.bins)
+        light = seen.bands.mean(axis=0)
+        spread = float((light > MIN_LIGHT * light.max()).mean())
+        self._blurs = spread >= MIN_SPREAD and find_gain_step(seen.bands) is None
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> EvenFrame:
-        """Return a frame, (rows, cols) or (rows, cols, 3), without the noise of its rows and columns, if it has any.
+        """Return a frame, (rows, cols) or (rows, cols, 3), without noise of rows and columns and a gain step, if any.
 
         Parameters
         ----------
@@ -93,7 +100,7 @@ class LineFinder:
         Returns
         -------
         EvenFrame
-            The same counts without such noise, else float32; saturated pixels keep their counts.
+            The same counts without such a fault, else float32; saturated pixels keep their counts.
 
         Raises
         ------
@@ -108,7 +115,9 @@ class LineFinder:
             return EvenFrame(counts, {})
         names = {name for channel in channels for name in channel.figures}
         figures = {name: max(channel.figures.get(name, 0.0) for channel in channels) for name in sorted(names)}
-        return EvenFrame(np.stack([np.asarray(channel.counts, np.float32) for channel in channels], -1), figures)
+        notes = max((channel.notes for channel in channels), key=len)
+        even = np.stack([np.asarray(channel.counts, np.float32) for channel in channels], -1)
+        return EvenFrame(even, figures, notes)
 
     def _even(self, counts: Pixels, dark: Pixels | None) -> EvenFrame:
         offset = self._dark if dark is None else np.asarray(dark, np.float32)
@@ -116,26 +125,31 @@ class LineFinder:
         lines = lines_of(counts)
         if not lines.likeness.size or (lines.likeness > SAME).mean() > MAX_REPEATED:  # one row, or a scaled file
             return EvenFrame(counts, {})
-        columns = line_noise(lines.bands - dark_lines.bands)
-        rows = line_noise(_row_bands(lines.bins - dark_lines.bins))
+        light = lines.bands - dark_lines.bands
+        columns, rows = line_noise(light), line_noise(_row_bands(lines.bins - dark_lines.bins))
+        named = (("column_noise_dn", columns), ("row_noise_dn", rows))
+        figures = {name: noise.rms_dn for name, noise in named if noise is not None}
+        notes: tuple[str, ...] = ()
+        step = find_gain_step(light) if self._blurs and columns is None else None
+        if step is not None:
+            columns, figures["gain_step"], notes = step.as_noise(counts.shape[1]), abs(step.share), (step.words,)
         even = EvenFrame(counts, {})
-        if columns is not None or rows is not None:
-            even = self._without(counts, offset, {"column_noise_dn": columns, "row_noise_dn": rows})
+        if figures:
+            even = EvenFrame(self._without(counts, offset, columns, rows), figures, notes)
             lines = lines_of(even.counts)  # noise of columns makes rows alike
         self._order(even.counts, lines.bins - dark_lines.bins, lines.likeness, lines.unknown)
         return even
 
-    def _without(self, counts: Pixels, offset: Image, noises: Mapping[str, LineNoise | None]) -> EvenFrame:
-        """Return the counts without the noise of the columns, the first one, and of the rows."""
+    def _without(self, counts: Pixels, offset: Image, columns: LineNoise | None, rows: LineNoise | None) -> Image:
+        """Return the counts without offset and gain of columns and rows."""
         light = np.asarray(counts - offset, np.float32)
-        for axis, noise in enumerate(noises.values()):
+        for axis, noise in enumerate((columns, rows)):
             if noise is not None:
                 offset_dn, gain = (np.expand_dims(part, axis) for part in (noise.offset_dn, noise.gain))
                 light = (light - offset_dn) / gain
         below = np.nextafter(np.float32(self._white_dn), np.float32(0))
         even = np.where(counts >= self._white_dn, np.float32(self._white_dn), np.minimum(light + offset, below))
-        figures = {name: noise.rms_dn for name, noise in noises.items() if noise is not None}
-        return EvenFrame(np.asarray(even, np.float32), figures)
+        return np.asarray(even, np.float32)
 
 
 def _row_bands(bins: Image) -> Image:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from device.recon.estimation.ghost import Ghost, GhostTrace
 from device.recon.estimation.spots import Spots
 from device.recon.estimation.uneven_light import UnevenLight
 from device.recon.model.preprocessing import Linear
@@ -37,6 +38,10 @@ class Diagnostics:
     find_uneven
         Search for what may be uneven in the light of the frame, the most probable first, also after the next frame;
         None: nothing is uneven.
+    ghost_trace
+        What the residual shows of a displaced second image; None if it is unknown.
+    ghost
+        A displaced second image; None: none, or not searched for.
     """
 
     noise_dn: float | None = None
@@ -46,6 +51,8 @@ class Diagnostics:
     spots: Spots | None = None
     unevenness: float | None = None
     find_uneven: Callable[[], Sequence[UnevenLight]] | None = None
+    ghost_trace: GhostTrace | None = None
+    ghost: Ghost | None = None
 
 
 class Solver(Protocol):

@@ -17,6 +17,7 @@ import numpy as np
 
 from device.recon.assessment import quality_figures
 from device.recon.estimation.background import Background, without
+from device.recon.estimation.ghost import find_ghost, ghost_trace
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.estimation.power_law_prior import Fit, PowerLaw, PowerLawPrior
@@ -131,6 +132,8 @@ class EvidenceWiener:
             spots=known.spots if added.spots is None else added.spots,
             unevenness=known.unevenness if added.unevenness is None else added.unevenness,
             find_uneven=added.find_uneven or known.find_uneven,
+            ghost_trace=known.ghost_trace if added.ghost_trace is None else added.ghost_trace,
+            ghost=known.ghost if added.ghost is None else added.ghost,
             regularisation={**known.regularisation, **added.regularisation},
             quality={**known.quality, **added.quality},
         )
@@ -332,7 +335,10 @@ class TotalVariation(EvidenceWiener):
             self._add_diagnostics(Diagnostics(quality={"banding": banding}))
             seen = self.blurred[grid.slices]
             uneven = unevenness(left, seen, noise)
-            self._add_diagnostics(Diagnostics(unevenness=uneven))
+            trace = ghost_trace(left, out, self.model, self.shading.block)
+            is_seen = residual <= quality_figures.MAX_MISFIT
+            ghost = find_ghost(trace, left, out, self.blurred, self.model) if is_seen else None
+            self._add_diagnostics(Diagnostics(unevenness=uneven, ghost_trace=trace, ghost=ghost))
             if uneven > MIN_UNEVENNESS:
                 frame = Linear(self._y + self.stray, self._good.copy(), light_dn, 0.0, 0.0)
                 self._add_diagnostics(
