@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.grid import Grid
 from device.recon.reconstructor import Reconstructor
 from device.recon.solvers.solver import Solver
+from device.recon.solvers.tv import TotalVariation
 from device.recon.stage import Recipe, RoundDone, StageResult
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Image, Reconstruction
@@ -196,6 +198,30 @@ def test_estimated_memory_is_the_allocated_memory(method: str) -> None:
     tracemalloc.stop()
     assert reconstructor.stages
     assert allocated_bytes == pytest.approx(METHODS[method].memory_bytes(reconstructor.stages[0].grid), rel=0.25)
+
+
+class CountingStarts(TotalVariation):
+    """Solver that counts the frames that it solves."""
+
+    starts = 0
+
+    def start(self, *arguments: Any) -> None:
+        self.starts += 1
+        super().start(*arguments)
+
+
+def test_planning_solves_noise_without_corrections() -> None:
+    """Each correction is a solution of its own: they took a quarter of the time in which a head gets ready."""
+    built = []
+
+    def build(*arguments: Any) -> CountingStarts:
+        built.append(CountingStarts(*arguments))
+        return built[-1]
+
+    methods = {**METHODS, "variation": replace(METHODS["variation"], build=build)}
+    of = world(coarse(load_head(SCENES / "healthy.toml"), 8))
+    Reconstructor(simulated_calibration(of), of.shape, scenes.PLANNER, VirtualClock(), methods=methods)
+    assert [solver.starts for solver in built] == [2]  # to compile, and to measure
 
 
 def test_one_slow_run_does_not_refuse_the_stage_forever() -> None:
