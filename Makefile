@@ -114,12 +114,13 @@ INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibr
 	test_paper_report.py)
 # Minutes each: 1,250 damages, of which `make test` has a sample; an optic that no head has; the maker's chart; hard frames
 # of several eyes, of which `make test-faults` has the grid; montages; guided calibrations, updates, hasty fingers and every
-# alert in every language on the page, whose server side `make test-faults` tries.
+# alert in every language on the page, whose server side `make test-faults` tries; what moves on the page in every size.
 LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_full_field.py hard/test_quality.py hard/test_background.py hard/test_flicker.py \
 	hard/test_far_eyes.py hard/test_spots.py hard/test_dark_border.py hard/test_uneven_light.py hard/test_sensor_lines.py \
 	hard/test_given_field.py physics/test_lenslets.py unit/test_model_eye.py unit/test_calibration_sequence.py unit/test_montage.py \
 	journey/test_visit_montage.py browser/test_calibration_wizard.py browser/test_software_update.py \
-	browser/test_capture_edge_cases.py browser/test_alerts.py browser/test_instrument_faults.py)
+	browser/test_capture_edge_cases.py browser/test_alerts.py browser/test_instrument_faults.py browser/test_layout_shift.py \
+	golden/test_golden_all_scenes.py)
 NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
 # Workers take file after file in the order given: what takes long comes first, so that no worker begins it when the
 # others end. pytest drops a file that is named beside its folder, so that each is named once.
@@ -167,7 +168,7 @@ FORMAT ?= verity
 KEYS ?= out/keys
 
 test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files and scenes with their golden records.
-	@umockdev-wrapper $(BIN)/python -m pytest -n auto $(IN_ORDER) $(LONG_GOLDEN) $(filter-out $(LONG_GOLDEN),$(call tests_of,tests/golden))
+	@umockdev-wrapper $(BIN)/python -m pytest -n auto $(IN_ORDER) $(LONG_GOLDEN) $(filter-out $(LONG_GOLDEN) $(LONG),$(call tests_of,tests/golden))
 
 test-exam: .venv/ready ## Run ten thousand random sequences of presses, faults and signals on the exam; N=count.
 	@$(BIN)/python -m tests.property.exam_sequences $(N)

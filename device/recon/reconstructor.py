@@ -160,15 +160,24 @@ class Reconstructor:
             self._consistency = consistency  # noise needs no check
 
     def _warm_up(self) -> None:
-        """Run on noise to compile the kernels, touch the memory, and then measure the cost of each step."""
+        """Run on noise to compile the kernels, touch the memory, and then measure the cost of each step.
+
+        Without corrections: each is a solution of its own, and the forward model explains noise with none of them.
+        """
         noise = noise_frame(self.calibration, self.shape)
-        self(noise, rounds=1)  # compiles, if the cache of compiled code is empty
-        self(noise, np.zeros_like(noise), quick=True)  # a dark frame selects another compiled signature
+
+        def solve(dark: Pixels | None = None, rounds: int | None = None, quick: bool = False) -> None:
+            counts = self.lines(noise, dark).counts
+            asked = Asked(dark, False, rounds, quick, EyePsf.ESTIMATED)
+            deque(self._solve(FrameRun(self.stages[0], self.defects, self.clock, asked, counts, None, None)), maxlen=0)
+
+        solve(rounds=1)  # compiles, if the cache of compiled code is empty
+        solve(np.zeros_like(noise), quick=True)  # a dark frame selects another compiled signature
         for stage in self.stages:
             stage.forget_costs()
         self._costs = RefractionCosts(self.stages[0].pace)
         for _ in range(LEAST_RUNS):
-            self(noise, rounds=2)
+            solve(rounds=2)
             for eye in (Wavefront(1.0), None):
                 self._refocus(eye)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from device.clock import Clock
+from device.config.image_files import Raw
 from device.errors import DiffuscopeError, FrameError
 from device.recon.assessment.metrics import FIT, RANGE, shift_px
 from device.recon.estimation.psf_selection import most_likely_psf
@@ -93,10 +94,9 @@ def case_of(pair: Pair, calibration: Calibration, aligned: bool) -> Case:
     return Case(pair.name, pair.raw.pixels, grey(pair.truth), None, calibration, not aligned)
 
 
-def without_bad_pixels(pair: Pair) -> Pixels:
+def without_bad_pixels(raw: Raw) -> Pixels:
     """Return the counts with bad pixels set to the median, for peers that take no mask."""
-    pixels = pair.raw.pixels
-    bad = pair.raw.bad
+    pixels, bad = raw.pixels, raw.bad
     if not bad.any():
         return pixels
     filled = pixels.copy()
@@ -205,7 +205,7 @@ class _Run:
                 self.leave_out(pair.name, name, error, progress)
         if self.peer is not None:
             try:
-                pictures = self.peer(without_bad_pixels(pair), calibration.psfs[0].pixels)
+                pictures = self.peer(without_bad_pixels(pair.raw), calibration.psfs[0].pixels)
             except DiffuscopeError as error:
                 self.leave_out(pair.name, "LenslessPiCam", error, progress)
                 return

@@ -176,7 +176,7 @@ class _Measured:
     ) -> Iterator[PairScore]:
         """Yield the scores of the peer in the region and at the shift of the methods."""
         judge = PairScorer(self.case.truth, scored_region(self.case)[0], shift)
-        pictures = peer(without_bad_pixels(self.pair), self.case.calibration.psfs[0].pixels)
+        pictures = peer(without_bad_pixels(self.pair.raw), self.case.calibration.psfs[0].pixels)
         for rounds, result in zip(peer.rounds, pictures, strict=True):
             times = fft.times(result.seconds)
             score = PairScore(self.pair.name, result.name, 1, rounds, *times, *judge(result.picture))

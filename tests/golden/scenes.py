@@ -13,6 +13,8 @@ from tests.simulated import SCENES, coarse, exposed_counts, world
 
 K = 4  # K x K pixels of the scene's sensor are combined in the simulated calibration
 BLOCKS = 4  # along each axis
+TOLERANCE = 1e-3  # one count more or less where a value is rounded; 4e-4 was seen between two processors
+SAMPLE = ("colour_sensor", "crowded_imx296", "diabetic", "drifting_eye", "healthy", "human_eye_imx477", "worn_sensor")
 
 
 def names() -> list[str]:
@@ -40,6 +42,11 @@ def record(name: str) -> dict[str, Any]:
     }
     seen = {key: figures(np.asarray(array)) for key, array in arrays.items()}
     return seen | {"calibration_psf": figures(calibration.psfs[0].pixels), "plan": plan}
+
+
+def difference(name: str) -> str:
+    """Return the difference of one scene from its record beyond the tolerance; "" without one."""
+    return compare.difference(compare.read("scenes")[name], record(name), TOLERANCE)
 
 
 def figures(array: np.ndarray) -> dict[str, Any]:

@@ -18,7 +18,8 @@ def hard(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for hard-cases.json, .md and pictures.")],
     case: Annotated[list[str] | None, typer.Option(help="Just this row; may be repeated.")] = None,
     method: Annotated[
-        list[str] | None, typer.Option(help="Just this column: ladder (as shipped) or a method; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Just this column: ladder (as shipped), a method, LenslessPiCam; may be repeated."),
     ] = None,
     merged: Annotated[int, typer.Option(min=1, max=4, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
     drawn: Annotated[int, typer.Option(min=0, help="Of so many drawn eyes, instead of the three of the table.")] = 0,

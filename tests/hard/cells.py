@@ -15,14 +15,17 @@ from device.errors import DiffuscopeError
 from device.recon.assessment.metrics import pcc
 from device.recon.methods import METHODS
 from device.recon.model.fft_plans import Planner
-from device.values import Image, Mask, Reconstruction
+from device.values import Image, Mask, Reconstruction, Report
+from services.research.benchmark import without_bad_pixels
+from services.research.peers import LenslessPeer
 from services.research.reconstruct_file import FileReconstructor
-from services.research.reconstruct_inputs import ReconstructOptions
+from services.research.reconstruct_inputs import ReconstructOptions, load_raw
 from tests.hard.cases import CLEAN, Case
 from tests.hard.frames import Eye, HardFrame, head_toml
 
 DEFAULT_SCHEDULE = "ladder"  # the default schedule: quick look, refraction, iterations
 COLUMNS = (DEFAULT_SCHEDULE, *METHODS)
+PEER, PEER_ROUNDS = "LenslessPiCam", 10  # its ADMM, twice the rounds of its own settings; it gives no messages
 LONG_DEADLINE_S = 600.0  # of the command: it stops no solver, so the grid has none
 CRASHES = (ArithmeticError, ValueError, LookupError, TypeError)  # program errors, reported as `Cell.crashed`
 CACHE_SIZE = 8  # cached reconstructors; each plan of one takes up to about 300 MB at full sensor size
@@ -85,11 +88,15 @@ class SolverCache:
 class CaseRunner:
     """Runner of the cases of one eye; reconstructs each with the default schedule and every method (`columns`).
 
-    The pictures of the clean case are the references, one per column; AssertionError if one is refused.
+    `peer` makes the pictures of the column PEER. The pictures of the clean case are the references, one per column;
+    AssertionError if one is refused.
     """
 
-    def __init__(self, eye: Eye, folder: Path, columns: tuple[str, ...] = COLUMNS) -> None:
+    def __init__(
+        self, eye: Eye, folder: Path, columns: tuple[str, ...] = COLUMNS, peer: LenslessPeer | None = None
+    ) -> None:
         self.eye, self.folder, self.columns = eye, folder, columns
+        self._peer = peer
         self._solvers = SolverCache()
         self._clean: dict[str, Image] = {}
         self._inside: Mask = eye.clean.simulated.inside
@@ -105,7 +112,7 @@ class CaseRunner:
     def _cell(self, case: Case, frame: HardFrame, column: str) -> Cell:
         raw, order, files = self.files(frame, column)
         try:
-            made = self._solvers(raw, order, files)
+            made = self._by_peer(raw, frame) if column == PEER else self._solvers(raw, order, files)
         except (DiffuscopeError, *CRASHES) as error:
             ours = isinstance(error, DiffuscopeError)
             words = error.message if isinstance(error, DiffuscopeError) else f"{type(error).__name__}: {error}"
@@ -132,6 +139,15 @@ class CaseRunner:
             frame.sphere_dpt,
             dict(made.report.quality),
         )
+
+    def _by_peer(self, file: Path, frame: HardFrame) -> Reconstruction:
+        """Return the peer's picture of a raw minus the black level, with bad pixels at the median."""
+        assert self._peer is not None
+        counts = without_bad_pixels(load_raw(file).raw).astype(np.float32) - np.float32(frame.head.camera.black_dn)
+        (made,) = self._peer(counts, frame.psf)
+        if not np.isfinite(made.picture).all():
+            raise ArithmeticError("the picture is not finite")
+        return Reconstruction(made.picture, Report(made.name), simulated=True)
 
     def _region(self, frame: HardFrame) -> Mask:
         if frame.seen is None:

@@ -40,13 +40,20 @@ def recorded() -> Margins:
     return json.loads(MARGINS.read_text(encoding="utf-8")) if MARGINS.exists() else {}
 
 
-def margins_table(margins: Margins) -> str:
-    """Return the worst margin of each test function as Markdown: the error over its bound, and the bound."""
+def worst_margins(margins: Margins) -> dict[str, tuple[float, float]]:
+    """Return error and bound of each test function, those with the largest ratio."""
     worst: dict[str, tuple[float, float]] = {}
     for node, pairs in margins.items():
         name = re.sub(r"\[.*", "", node.split("::")[1]).removeprefix("test_")
         worst[name] = max([*pairs, *([worst[name]] if name in worst else [])], key=lambda pair: pair[0] / pair[1])
-    rows = [f"| `{name}` | {seen / bound:.2f} | {bound:.3g} |" for name, (seen, bound) in worst.items()]
+    return worst
+
+
+def margins_table(margins: Margins) -> str:
+    """Return the worst margin of each test function as Markdown: the error over its bound, and the bound."""
+    rows = [
+        f"| `{name}` | {seen / bound:.2f} | {bound:.3g} |" for name, (seen, bound) in worst_margins(margins).items()
+    ]
     return "\n".join(["| test | error / bound, the largest | bound |", "|---|---|---|", *rows])
 
 

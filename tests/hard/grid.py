@@ -11,12 +11,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from device.errors import SettingError
+from services.research.peers import ENVIRONMENT, installed_peer
 from services.research.reconstruct_file import write_or_raise
 from tests.hard.cases import CASES, CLEAN, NAMED
-from tests.hard.cells import COLUMNS, DEFAULT_SCHEDULE, CaseRunner, Cell
-from tests.hard.figures import margins_table, recorded
+from tests.hard.cells import COLUMNS, DEFAULT_SCHEDULE, PEER, PEER_ROUNDS, CaseRunner, Cell
+from tests.hard.figures import margins_table, recorded, worst_margins
 from tests.hard.frames import Eye
-from tests.hard.judgement import LOST, Violation, covered, ratio, violations
+from tests.hard.judgement import LOST, Violation, covered, judged, ratio, violations
 from tests.hard.picture import draw_grid, explanations, table
 
 EYES = (
@@ -25,7 +26,10 @@ EYES = (
     Eye("long-sighted eye, IMX296", "imx296", {"sim.seed": 5, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}),
 )
 DRAWN_DPT = 4.0  # drawn eyes have a mean sphere between minus and plus that
-QUICK_MERGED, QUICK_COLUMNS = 4, (DEFAULT_SCHEDULE, "gradient")  # of one eye: within a minute on a laptop
+QUICK_MERGED, QUICK_COLUMNS = (
+    4,
+    (DEFAULT_SCHEDULE, "gradient", PEER),
+)  # of one eye: within a minute on a laptop
 QUICK = (
     "1.0% saturated",
     "glare, 0.3 % clipped",
@@ -71,7 +75,7 @@ class HardCases:
 
     def picture(self, eye: str) -> str:
         """Return the SVG of one eye's grid."""
-        return draw_grid(self.cells, self.violations, eye, self.columns)
+        return draw_grid(self.cells, self.violations, eye, self.columns, worst_margins(recorded()))
 
 
 def run(
@@ -82,21 +86,24 @@ def run(
 ) -> HardCases:
     """Run the cases `keys` (default: all) and the clean one of each eye through `columns`; return cells and violations.
 
-    `progress` is called with one line per eye and case. SettingError for an unknown case or column.
+    `progress` is called with one line per eye and case. The column PEER is left out where LenslessPiCam is not
+    installed. SettingError for an unknown case or column.
     """
-    for known, asked, what in ((NAMED, keys, "hard case"), (COLUMNS, columns, "column")):
+    for known, asked, what in ((NAMED, keys, "hard case"), ((*COLUMNS, PEER), columns, "column")):
         for name in asked:
             if name not in known:
                 raise SettingError(f"no {what} is called {name!r}", f"Choose from: {'; '.join(known)}.")
     cells: list[Cell] = []
-    for eye in eyes:
-        progress(f"{eye.name}: planning")
-        with TemporaryDirectory() as folder:
-            grid = CaseRunner(eye, Path(folder), columns)
-            for case in CASES:
-                if not keys or case.key in keys or case is CLEAN:
-                    cells += grid.cells(case)
-                    progress(f"{eye.name}: {case.key}: {_brief(cells[-len(columns)])}")
+    with installed_peer(ENVIRONMENT if PEER in columns else None, (PEER_ROUNDS,), progress) as peer:
+        columns = tuple(name for name in columns if name != PEER or peer is not None)
+        for eye in eyes:
+            progress(f"{eye.name}: planning")
+            with TemporaryDirectory() as folder:
+                grid = CaseRunner(eye, Path(folder), columns, peer)
+                for case in CASES:
+                    if not keys or case.key in keys or case is CLEAN:
+                        cells += grid.cells(case)
+                        progress(f"{eye.name}: {case.key}: {_brief(cells[-len(columns)])}")
     return HardCases(columns, tuple(cells), tuple(violations(cells)))
 
 
@@ -158,4 +165,4 @@ def summary(found: HardCases) -> str:
         f"* {violation.rule}: {violation.eye}; {violation.case}; {violation.method}: {violation.words}"
         for violation in found.violations
     ]
-    return "\n".join([*lines, f"{len(found.violations)} violations of {len(found.cells)} cells"])
+    return "\n".join([*lines, f"{len(found.violations)} violations of {len(judged(found.cells))} cells"])

@@ -23,8 +23,17 @@ LEGEND = (
 )
 
 
-def draw_grid(cells: Sequence[Cell], broken: Sequence[Violation], eye: str, columns: Sequence[str]) -> str:
-    """Return the SVG of one eye's grid; colour: loss over the allowed one, red frame: violation."""
+def draw_grid(
+    cells: Sequence[Cell],
+    broken: Sequence[Violation],
+    eye: str,
+    columns: Sequence[str],
+    margins: Mapping[str, tuple[float, float]],
+) -> str:
+    """Return the SVG of one eye's grid; colour: loss over the allowed one, red frame: violation.
+
+    Below it the `margins`, error and bound of each test with a bound, as error over bound.
+    """
     mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
     bad = {(violation.case, violation.method) for violation in broken if violation.eye == eye}
     inner, y, group = [], TOP, ""
@@ -39,7 +48,25 @@ def draw_grid(cells: Sequence[Cell], broken: Sequence[Violation], eye: str, colu
             cell = mine[case.key, column]
             inner += _cell(cell, LEFT + k * WIDE, y, (case.key, column) in bad)
         y += TALL
-    return _document(eye, columns, inner, y)
+    below = y + 3 * SKIP
+    return _document(eye, columns, [*inner, *_margins(margins, below)], below + (len(margins) + 1) * TALL)
+
+
+def _margins(margins: Mapping[str, tuple[float, float]], y: int) -> list[str]:
+    out = [text(20, y + TALL - 7, "error over its bound, where a bound is known: limit 1", "small")] if margins else []
+    for k, (name, (error, bound)) in enumerate(margins.items(), 1):
+        colour, ink = _shade(error / bound)
+        out += [
+            _box(20, y + k * TALL, 60, TALL - GAP, colour),
+            _label(50, y + (k + 1) * TALL - 8, f"{error / bound:.2f}", ink),
+            text(90, y + (k + 1) * TALL - 7, name.replace("_", " "), "small"),
+        ]
+    return out
+
+
+def _shade(share: float) -> tuple[str, str]:
+    """Return the colours of box and text of a loss over the allowed one; of NaN those of the largest loss."""
+    return next(((colour, ink) for limit, colour, ink in SHADES if share < limit), SHADES[-1][1:])
 
 
 def _document(eye: str, columns: Sequence[str], inner: Sequence[str], y: int) -> str:
@@ -66,7 +93,7 @@ def _cell(cell: Cell, x: int, y: int, broken: bool) -> list[str]:
     words, says = "crashed" if cell.crashed else "refused", cell.refused
     share = ratio(cell)
     if share is not None:
-        colour, ink = next((c, i) for limit, c, i in SHADES if not share >= limit)
+        colour, ink = _shade(share)
         explained = lost(cell) and explanation(cell, NAMED[cell.case])
         marks = ("m" if cell.warnings else "") + ("e" if explained else "")
         words = f"{share:.2f} {marks}".rstrip()

@@ -12,7 +12,7 @@ import pytest
 
 from services.research.reconstruct_file import OutputFiles, reconstruct_file
 from tests.hard.cases import CASES, CLEAN, NAMED
-from tests.hard.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
+from tests.hard.cells import DEFAULT_SCHEDULE, PEER, CaseRunner, Cell
 from tests.hard.frames import Eye
 from tests.hard.grid import QUICK, QUICK_MERGED, run
 from tests.hard.judgement import KINDS, LOST, covered, kind, lost, ratio, violations
@@ -98,7 +98,16 @@ def test_table_and_picture_hold_the_loss_over_the_allowed_one() -> None:
         [" clean ", " 0.00 "],
         [" motion 0.5 deg ", " 2.00 "],
     ]
-    assert "2.00 m" in draw_grid([GOOD, worse], [], "eye", (DEFAULT_SCHEDULE,))
+    drawn = draw_grid([GOOD, worse], [], "eye", (DEFAULT_SCHEDULE,), {"of_a_bound": (1.0, 4.0)})
+    assert all(words in drawn for words in ("2.00 m", "of a bound", "0.25"))
+
+
+def test_the_peer_is_drawn_and_not_judged() -> None:
+    peer = replace(OTHER, method=PEER, pcc=0.1, lost=0.85)
+    assert violations([GOOD, OTHER, peer]) == []
+    assert "17.00" in draw_grid(
+        [GOOD, replace(GOOD, method=PEER), OTHER, peer], [], "eye", (DEFAULT_SCHEDULE, PEER), {}
+    )
 
 
 def test_every_case_has_known_kinds_of_warnings() -> None:

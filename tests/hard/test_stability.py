@@ -33,14 +33,20 @@ def frame() -> Image:
     return EYE.clean.raw.astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def reconstructor() -> Reconstructor:
-    return Reconstructor(EYE.clean.simulated.calibration, EYE.clean.simulated.shape, scenes.PLANNER, VirtualClock())
-
-
-@pytest.fixture(scope="module")
-def solve(reconstructor: Reconstructor) -> Solve:
+def default_solve(**options: bool) -> Solve:
+    of = EYE.clean.simulated
+    reconstructor = Reconstructor(of.calibration, of.shape, scenes.PLANNER, VirtualClock(), **options)
     return lambda y: reconstructor(y).picture.astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def solve() -> Solve:
+    return default_solve()
+
+
+@pytest.fixture(scope="module")
+def picture(solve: Solve, frame: Image) -> Image:
+    return solve(frame)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +56,8 @@ def noise_dn(frame: Image) -> Image:
     return np.sqrt(np.maximum(frame - camera.black_dn, 1) / camera.gain_e_per_dn)
 
 
-def gain(solve: Solve, y: Image, change: Image) -> float:
-    return float(np.linalg.norm(solve((y + change).astype(np.float32)) - solve(y)) / np.linalg.norm(change))
+def gain(solve: Solve, y: Image, picture: Image, change: Image) -> float:
+    return float(np.linalg.norm(solve((y + change).astype(np.float32)) - picture) / np.linalg.norm(change))
 
 
 def worst_direction(solve: Solve, y: Image, size: float, rounds: int = 6) -> Image:
@@ -70,31 +76,34 @@ def worst_direction(solve: Solve, y: Image, size: float, rounds: int = 6) -> Ima
     return (size / np.linalg.norm(direction) * direction).astype(np.float32)
 
 
-def test_the_same_frame_gives_the_same_picture(solve: Solve, frame: Image) -> None:
-    assert np.array_equal(solve(frame), solve(frame))
+def test_the_same_frame_gives_the_same_picture(solve: Solve, frame: Image, picture: Image) -> None:
+    assert np.array_equal(solve(frame), picture)
 
 
 @pytest.mark.parametrize("share", [0.03, 0.3, 1.0])
 def test_random_changes_of_the_size_of_the_noise(
-    share: float, solve: Solve, frame: Image, noise_dn: Image, within: Within
+    share: float, solve: Solve, frame: Image, picture: Image, noise_dn: Image, within: Within
 ) -> None:
     rng = np.random.default_rng(7)
-    within(max(gain(solve, frame, share * noise_dn * rng.standard_normal(frame.shape)) for _ in range(4)), RANDOM)
+    changes = (share * noise_dn * rng.standard_normal(frame.shape) for _ in range(4))
+    within(max(gain(solve, frame, picture, change) for change in changes), RANDOM)
 
 
 @pytest.mark.parametrize("share", [0.03, 0.3])
 def test_the_worst_change_that_a_power_iteration_finds(
-    share: float, solve: Solve, frame: Image, noise_dn: Image, within: Within
+    share: float, solve: Solve, frame: Image, picture: Image, noise_dn: Image, within: Within
 ) -> None:
+    """The search leaves the refraction as it is, which takes most of the time; the gain is that of the whole."""
     size = share * float(np.linalg.norm(noise_dn))
-    within(gain(solve, frame, worst_direction(solve, frame, size)), ADVERSE)
+    change = worst_direction(default_solve(refract=False), frame, size)
+    within(gain(solve, frame, picture, change), ADVERSE)
 
 
 @pytest.mark.parametrize("more_dn", [1.0, 30.0])
-def test_one_pixel(more_dn: float, solve: Solve, frame: Image, within: Within) -> None:
+def test_one_pixel(more_dn: float, solve: Solve, frame: Image, picture: Image, within: Within) -> None:
     change = np.zeros_like(frame)
     change[frame.shape[0] // 2, frame.shape[1] // 2] = more_dn
-    within(gain(solve, frame, change), PIXEL)
+    within(gain(solve, frame, picture, change), PIXEL)
 
 
 @pytest.mark.parametrize("radius_px", [0, 1, 4, 9, 15])
@@ -129,6 +138,6 @@ def test_tikhonov_keeps_its_bound_in_its_worst_direction(
         return make(y).picture.astype(np.float64)
 
     size = share * float(np.linalg.norm(noise_dn))
-    seen = gain(solved, frame, worst_direction(solved, frame, size)) * 2 * np.sqrt(mu)
+    seen = gain(solved, frame, solved(frame), worst_direction(solved, frame, size)) * 2 * np.sqrt(mu)
     within(seen, 1 + 1e-3)
     assert seen > 0.9  # the search finds the known worst direction

@@ -144,9 +144,9 @@ def refined(of: RefractionEstimator, counts: Pixels) -> Refraction:
 
 def test_little_light_does_not_shift_the_refraction(dim: World, of_dim: RefractionEstimator) -> None:
     """Samples that were weighted and chosen by their own noise shifted each of these frames by 0.23 dioptres."""
-    found = [refined(of_dim, dim_counts(dim, seed)) for seed in range(8)]
+    found = [refined(of_dim, dim_counts(dim, seed)) for seed in range(4)]
     sd_dpt = float(np.mean([refraction.sd_dpt for refraction in found]))
-    # 2.5: the mean of eight frames is beyond it once in a hundred times
+    # 2.5: the mean of four frames is beyond it once in a hundred times
     assert abs(np.mean([refraction.m_dpt for refraction in found])) < 2.5 * sd_dpt / np.sqrt(len(found))
 
 
