@@ -21,6 +21,7 @@ from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.psf_consistency import PsfConsistency
 from device.recon.assessment.quality_figures import (
+    LITTLE_LIGHT,
     MISMATCHES,
     NO_SIGNAL,
     PARTLY_LIT,
@@ -72,6 +73,7 @@ ENDINGS = (".npy", ".tif", ".tiff", ".png")
 MIN_SAMPLES = 16  # of the shorter side
 MAX_ROUNDS = 100_000
 MIN_GAMMA, MAX_GAMMA = 0.2, 5.0
+MAX_FILLED = 5e-4  # share of missing pixels that a periodic method fills: at 0.1 % it loses a third of the PCC
 MAX_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
 ONCE = "FFTW_ESTIMATE"  # plans of one picture: to measure them takes longer than the picture. Measured ones are used
 KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up to about 300 MB at full sensor size
@@ -353,7 +355,7 @@ class _FrameSolvers:
         report = replace(
             file_report(main, solvers[0], options),
             seconds=summed_seconds(made),
-            warnings=(*_united(made), *doubts(main, solvers[0], loaded.notes)),
+            warnings=(*_united(made), *doubts(main, solvers[0], loaded.notes), *note_on_missing(main)),
             psf_channels=len(made),
             bayer=loaded.bayer,
         )
@@ -364,7 +366,7 @@ class _FrameSolvers:
         method = METHODS.get(self._options.method or "")
         if method is None or method.rounds or self._options.budget_s is not None or self._options.head is None:
             return False
-        return is_doubtful(report, self._options) or any(map(is_doubt_of_psf_or_field, report.warnings))
+        return is_doubtful(report, self._options) or any(map(is_doubt, report.warnings))
 
     def smaller_field(self, report: Report, loaded: LoadedRaw) -> LitField | None:
         """Return the lit disc of a solved raw where it is smaller than the field; SettingError where it is larger."""
@@ -403,15 +405,15 @@ class _FrameSolvers:
         return index
 
 
-def is_doubt_of_psf_or_field(warning: str) -> bool:
-    """Return whether a warning says that PSF and frame do not match, or that a part of the field is dark."""
-    return warning in MISMATCHES.values() or PARTLY_LIT in warning
+def is_doubt(warning: str) -> bool:
+    """Return whether a warning says that PSF and frame do not match, or that a part of the field or all is dark."""
+    return warning in MISMATCHES.values() or PARTLY_LIT in warning or LITTLE_LIGHT in warning
 
 
 def judged(report: FileReport, default: FileReport) -> FileReport:
     """Return the report of a closed form with the doubts that the default method has of the same frame."""
-    warnings = [warning for warning in report.warnings if not is_doubt_of_psf_or_field(warning)]
-    doubtful = [words for words in default.warnings if is_doubt_of_psf_or_field(words) or words.startswith(UNEXPLAINED)]
+    warnings = [warning for warning in report.warnings if not is_doubt(warning)]
+    doubtful = [words for words in default.warnings if is_doubt(words) or words.startswith(UNEXPLAINED)]
     share = default.quality.get("spots")
     if share:
         warnings.append(
@@ -459,6 +461,15 @@ def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tup
             "of it may be false."
         )
     return tuple(found)
+
+
+def note_on_missing(report: Report) -> tuple[str, ...]:
+    """Return a sentence about missing pixels for a method that does not leave them out."""
+    method, share = METHODS.get(report.method), report.quality.get("missing") or 0.0
+    if method is None or not method.periodic or share <= MAX_FILLED:
+        return ()
+    filled = f"{share:.1%} of the pixels are missing, and '{report.method}' does not leave them out"
+    return (f"{filled}: use the default method.",)
 
 
 def _share_s(deadline: Deadline, channels_left: int) -> float:

@@ -27,7 +27,6 @@ from device.config.head_file import load_head
 from device.errors import SettingError
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.frame_run import EyePsf
-from device.recon.frame_run import EyePsf
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor
 from device.sim.scene_files import expose

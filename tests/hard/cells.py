@@ -116,6 +116,7 @@ class CaseRunner:
         except (DiffuscopeError, *CRASHES) as error:
             ours = isinstance(error, DiffuscopeError)
             words = error.message if isinstance(error, DiffuscopeError) else f"{type(error).__name__}: {error}"
+            words = words.replace(f"{self.folder}/", "")
             return Cell(self.eye.name, case.key, column, None, None, words, (), None, None, None, {}, not ours)
         picture = frame.simulated.sampled(made.picture)
         if case is CLEAN:
