@@ -197,7 +197,7 @@ class Corrections:
             if not run.fits(whole.duration_s):
                 break
             light = ghost.removal(last, run.done.grid)
-            again = yield from self._again(run.again(self._even(run, light)))
+            again = yield from self._again(run.again(self._even(run, light), white=False))
             if again is None:
                 break
             tried.append(again)

@@ -29,13 +29,17 @@ class EyePsf(Enum):
 
 @dataclass(frozen=True)
 class Asked:
-    """What `Reconstructor.steps` was asked for: its arguments that are the same for a corrected frame."""
+    """What `Reconstructor.steps` was asked for: its arguments that are the same for a corrected frame.
+
+    `white` is False for a frame whose noise a correction has coloured: its spectrum says nothing about the PSF.
+    """
 
     dark: Pixels | None
     simulated: bool
     rounds: int | None
     quick: bool
     eye_psf: EyePsf
+    white: bool = True
 
 
 @dataclass(frozen=True)
@@ -96,9 +100,10 @@ class FrameRun:
         self.refraction: Refraction | NoRefraction | None = None
         self.refraction_s = self.cylinder_s = self.between_s = 0.0
 
-    def again(self, counts: Pixels, joined: Image | None = None) -> "FrameRun":
-        """Return the run of a corrected frame, to the same deadline."""
-        return FrameRun(self._first, self._defects, self.clock, self.asked, counts, joined, self.deadline)
+    def again(self, counts: Pixels, joined: Image | None = None, white: bool = True) -> "FrameRun":
+        """Return the run of a corrected frame, to the same deadline; `white`: its noise has kept its spectrum."""
+        asked = replace(self.asked, white=self.asked.white and white)
+        return FrameRun(self._first, self._defects, self.clock, asked, counts, joined, self.deadline)
 
     @property
     def channels(self) -> int:

@@ -21,6 +21,7 @@ from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsi
 from device.recon.assessment.quality_figures import (
     NO_SIGNAL,
     PSF_FIGURES,
+    STRUCTURE,
     Audience,
     is_explained,
     is_lit,
@@ -476,6 +477,8 @@ class Reconstructor:
         diagnostics = run.solved.diagnostics
         dark = not run.solved.has_light
         quality = run.solved.quality
+        if not run.asked.white:
+            quality |= {key: None for key in STRUCTURE if key in quality}
         if run.done.is_closed_form and len(self.stages) == 1:  # no residual, which would show bands: the row means do
             quality |= _flicker_of_rows(self.corrections.flicker, run)
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None

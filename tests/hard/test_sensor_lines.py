@@ -38,6 +38,18 @@ def test_rows_out_of_order_are_refused(head: str, of: Callable[[Counts, float], 
         eye.make(of(eye.frames[0], 0.022))
 
 
+def test_dust_is_no_place_where_rows_are_missing() -> None:
+    """Of 30 frames with 3 to 19 spots; with a limit for three of eight segments five were refused."""
+    eye, rng = exposed("imx296", -4.0, 8000.0), np.random.default_rng(0)
+    rows, cols = np.indices(eye.frames[0].shape)
+    for _ in range(30):
+        share = np.ones(rows.shape, np.float32)
+        for _ in range(rng.integers(3, 20)):
+            row, col = (rng.uniform(0.1, 0.9) * size for size in rows.shape)
+            share[np.hypot(rows - row, cols - col) < rng.uniform(4, 14)] = rng.uniform(0.2, 0.7)
+        eye.make.lines(eye.under(share, np.zeros_like(share)))
+
+
 @pytest.mark.parametrize("index", [0, 2])
 def test_a_burst_leaves_out_a_frame_with_repeated_rows(index: int) -> None:
     eye = Exposed("sim", 0.0, 1500.0, frames=4)

@@ -29,7 +29,8 @@ MIN_LIGHT_SNR = 5500.0
 MAX_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the spectrum rise as the picture gets worse
 MAX_SATURATED = 0.001  # share of the pixels
 # Figures that use the PSF: set to None if the model does not explain the frame.
-PSF_FIGURES = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")
+STRUCTURE = ("structure_nats", "structure_sure")
+PSF_FIGURES = (*STRUCTURE, "cutoff_per_px", "resolution_um", "coverage")
 SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
 FAINT_DN = 1e-9
 NO_SIGNAL = "There is no signal in this frame."

@@ -21,12 +21,14 @@ MIN_REPEATED = 0.004  # of the rows
 MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
 MIN_VALUES = 16  # different values of a row: dark and saturated rows repeat by chance
 SEGMENTS = 8  # of a row, so that a spot, which lies in few, does not decide
-SEEN = 3  # of them must show a jump
+SEEN = (
+    5  # of them must show a jump: 3 to 19 dust spots in a row looked like one in 16 of 180 frames with 3, in 1 with 4
+)
 MIN_ROWS = 256  # of a sensor: in few and short rows texture is alike by chance, and a PSF as steep as a jump
 SPANS = 135  # in the height of a frame: rows above and below, whose means are compared
 # Their difference over the largest one near by, of the counts and of the shares of a segment's light. Clean frames have
-# up to 1.3 and 1.3, reflexes and dust 1.6 and 1.5, bright frames without 24 of 1080 rows at least 3.2 and 2.6.
-MIN_JUMPS = (1.8, 1.6)
+# up to 1.1 and 0.9, dust 1.5 and 1.35; bright frames without 2.2 % of their rows 2.2 and 2.0 (median).
+MIN_JUMPS = (1.6, 1.42)
 FAINT = 1e-9
 MIN_LIGHT = 0.2  # of the brightest row
 EVEN = 0.5  # of the brightest of the compared rows: with less it is dead, or the frame ends there
