@@ -6,6 +6,7 @@ better. None begins that would end after the deadline.
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import hypot
 from typing import NamedTuple
 
 import numpy as np
@@ -16,12 +17,13 @@ from device.recon.durations import DurationEstimate, Pace
 from device.recon.estimation.flicker import FlickerFinder
 from device.recon.estimation.ghost import Ghost, share_of
 from device.recon.estimation.refraction.estimator import NoRefraction
-from device.recon.estimation.refraction.notation import widened
+from device.recon.estimation.refraction.notation import doubt_of, widened
+from device.recon.estimation.sensor_lines import LINE_NOISES
 from device.recon.estimation.spots import Spots, on_sensor
 from device.recon.estimation.uneven_light import FALLS, UnevenLight
 from device.recon.frame_run import FrameRun
 from device.recon.stage import Step
-from device.values import Calibration, Image, Mask, Reconstruction
+from device.values import Calibration, Image, Mask, Reconstruction, Report
 
 SPOT_SEARCHES = 4
 GHOST_SEARCHES = 4
@@ -35,6 +37,7 @@ DUST = (
     "Dark spots, {share:.1%} of the frame, were left out; the largest is at row {row}, column {col} of the sensor. "
     "Clean sensor and diffuser; if they stay, measure the flat frame again."
 )
+LINES_SD_DPT = 25.0  # of M, J0 and J45 per share of the light: errors of 15 to 40 in frames of 1 and 3 %, two sensors
 PUPIL_SOLUTIONS = 4  # duration of search, planning and solution for a pupil, in solutions of the frame
 PUPIL_SD_DPT = 0.5  # of M, J0 and J45 per hidden share of the PSF: 10 frames of 4 pupils were off by up to 0.9 times it
 PUPIL = (
@@ -289,8 +292,8 @@ class Corrections:
         if found is None:
             return whole
         report = found.made.report
-        eye = widened(report.refraction_dpt, PUPIL_SD_DPT * found.hidden)
-        again = Solution(found.run, replace(found.made, report=replace(report, refraction_dpt=eye)))
+        made = replace(found.made, report=_widened(report, PUPIL_SD_DPT * found.hidden))
+        again = Solution(found.run, made)
         if states_misfit(report.warnings) or not _falls(whole, again, 1.0 if is_cut else BETTER, MAX_EXPLAINED):
             return whole.choice(whole, [again])
         return whole.choice(again, [again]).with_correction("pupil", found.hidden, PUPIL.format(share=found.hidden))
@@ -304,6 +307,22 @@ def with_corrections(
     seconds = report.seconds | ({"correct": report.seconds.get("correct", 0.0) + others_s} if others_s else {})
     quality, warnings = {**report.quality, **found}, (*report.warnings, *notes)
     return replace(made, report=replace(report, seconds=seconds, quality=quality, warnings=warnings))
+
+
+def widened_by_lines(made: Reconstruction, faults: Mapping[str, float]) -> Reconstruction:
+    """Return a picture of a frame without its noise of lines: what is left of it widens the sd of the refraction."""
+    report = made.report
+    noise_dn, mean_dn = hypot(*(faults.get(name, 0.0) for name in LINE_NOISES)), report.quality.get("mean_dn")
+    if not noise_dn or not mean_dn:
+        return made
+    return replace(made, report=_widened(report, LINES_SD_DPT * noise_dn / mean_dn))
+
+
+def _widened(report: Report, more_sd_dpt: float) -> Report:
+    """Return a report whose refraction has one more standard deviation, with the message about an uncertain one."""
+    eye_dpt, said = widened(report.refraction_dpt, more_sd_dpt), doubt_of(report.refraction_dpt)
+    warnings = (*(words for words in report.warnings if words not in said), *doubt_of(eye_dpt))
+    return replace(report, refraction_dpt=eye_dpt, warnings=warnings)
 
 
 def _unevenness(run: FrameRun) -> float | None:

@@ -30,7 +30,7 @@ from device.recon.assessment.quality_figures import (
     psf_match,
     quality_warnings,
 )
-from device.recon.corrections import BehindPupil, Corrections, with_corrections
+from device.recon.corrections import BehindPupil, Corrections, widened_by_lines, with_corrections
 from device.recon.durations import LEAST_RUNS, Pace, RefractionCosts
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.flicker import FlickerFinder
@@ -44,7 +44,7 @@ from device.recon.estimation.refraction.estimator import (
     RefractionEstimator,
     can_estimate_refraction,
 )
-from device.recon.estimation.refraction.notation import report_of, scatter_of
+from device.recon.estimation.refraction.notation import doubt_of, report_of, scatter_of
 from device.recon.estimation.refraction.task import RefractionTask
 from device.recon.estimation.sensor_lines import LineFinder
 from device.recon.frame_run import NOTHING, Asked, EyePsf, FrameRun, Known
@@ -288,7 +288,7 @@ class Reconstructor:
         run = FrameRun(self.stages[0], self.defects, self.clock, asked, counts, joined, deadline)
         made = yield from self._solve(run, Known(refraction, others, look))
         made = yield from self.corrections(run, made)
-        yield with_corrections(made, faults, notes, others_s=0.0)
+        yield with_corrections(widened_by_lines(made, faults), faults, notes, others_s=0.0)
 
     def _solve(self, run: FrameRun, known: Known = NOTHING) -> Generator[Step, None, Reconstruction]:
         """Yield the steps before the picture, and return the picture."""
@@ -493,8 +493,8 @@ class Reconstructor:
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }
-        if isinstance(eye, Refraction) and (abs(eye.m_dpt) > 8 or eye.sd_dpt > 0.5):
-            warnings += (f"The refraction of {-eye.m_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
+        eye_dpt = None if eye is None else report_of(eye, self.calibration.refraction_zero)
+        warnings += doubt_of(eye_dpt)
         return Report(
             method=recipe.method,
             bin=recipe.bin,
@@ -504,7 +504,7 @@ class Reconstructor:
             psf_index=self.psf_index,
             psf_scale=psf_scale,
             psf_cylinder=self._psf_cylinder(run),
-            refraction_dpt=None if eye is None else report_of(eye, self.calibration.refraction_zero),
+            refraction_dpt=eye_dpt,
             refraction_scatter=scatter_of(eye),
             regularisation=dict(diagnostics.regularisation),
             noise_dn=noise_dn,

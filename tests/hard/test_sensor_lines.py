@@ -13,8 +13,11 @@ from tests import scenes
 from tests.hard import defects
 from tests.hard.exposed import Exposed, exposed
 
-LOST, STEP_LOST = 0.02, 0.005  # PCC
-REFRACTION_DPT = 0.15  # the standard deviation of these frames is about 0.05
+# PCC. Where the lit disc fills the sensor, no lines without light tell the noise of few cycles over the sensor from the
+# light of the retina: about half of its loss remains.
+LOST = {"sim": 0.02, "imx296": 0.05}
+STEP_LOST = {8000.0: 0.005, 500.0: 0.03}  # PCC; at 500 electrons the size of a step is known to a tenth
+REFRACTION_DPT = {8000.0: 0.15, 500.0: 0.35}  # three standard deviations of these frames
 PEAK_E = 1000.0  # noise of lines exceeds that of dim pixels only
 
 
@@ -27,7 +30,11 @@ def test_noise_of_lines_costs_little(head: str, name: str) -> None:
     noise = {"column_noise": defects.column_noise, "row_noise": defects.row_noise}[name]
     made = eye.make(noise(eye.frames[0], eye.spec.camera, 0.03))
     assert {"column_noise_dn", "row_noise_dn"} & set(made.report.quality) == {f"{name}_dn"}
-    assert eye.pcc(made) > eye.pcc(clean) - LOST
+    assert eye.pcc(made) > eye.pcc(clean) - LOST[head]
+    given = made.report.refraction_dpt
+    assert given is not None
+    if given["refused"] is None:
+        assert abs(given["sphere"]) < 3 * given["sd"]
 
 
 @pytest.mark.parametrize("head", ["sim", "imx296"])
@@ -74,9 +81,9 @@ def test_a_gain_step_costs_neither_picture_nor_refraction_and_is_reported(
     for at, share in ((0.5, 0.03), (0.35, -0.05)):
         gain = np.where(columns < round(at * len(columns)), 1, np.float32(1 + share))
         made = eye.make(eye.under(gain, np.zeros_like(gain)))
-        assert eye.pcc(made) > eye.pcc(clean) - STEP_LOST
+        assert eye.pcc(made) > eye.pcc(clean) - STEP_LOST[peak_e]
         assert made.report.quality["gain_step"] == pytest.approx(abs(share), abs=0.004)
         assert [words for words in made.report.warnings if f"at column {round(at * len(columns))}" in words]
         assert made.report.refraction_dpt is not None
         clean_dpt = clean.report.refraction_dpt["sphere"]
-        assert made.report.refraction_dpt["sphere"] == pytest.approx(clean_dpt, abs=REFRACTION_DPT)
+        assert made.report.refraction_dpt["sphere"] == pytest.approx(clean_dpt, abs=REFRACTION_DPT[peak_e])

@@ -16,6 +16,7 @@ from device.recon.model.kernels import Pixels
 from device.values import Image, Psf
 
 BINS = 100  # across the sensor
+LINE_NOISES = ("column_noise_dn", "row_noise_dn")  # in a report
 SAME = 0.999  # likeness of two equal rows, with the rounding of single precision
 
 
@@ -127,8 +128,8 @@ class LineFinder:
             return EvenFrame(counts, {})
         light = lines.bands - dark_lines.bands
         columns, rows = line_noise(light), line_noise(_row_bands(lines.bins - dark_lines.bins))
-        named = (("column_noise_dn", columns), ("row_noise_dn", rows))
-        figures = {name: noise.rms_dn for name, noise in named if noise is not None}
+        noises = zip(LINE_NOISES, (columns, rows), strict=True)
+        figures = {name: noise.rms_dn for name, noise in noises if noise is not None}
         notes: tuple[str, ...] = ()
         step = find_gain_step(light) if self._blurs and columns is None else None
         if step is not None:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from device.recon.estimation.refraction.estimator import NoRefraction, Refraction
 from device.values import RefractionZero
 
+FAR_DPT, MAX_SD_DPT = 8.0, 0.5  # beyond, a refraction is uncertain
 SCATTER_KEYS = ("frames", "sd_dpt", "stated_sd_dpt", "chi2")
 REFRACTION_KEYS = (
     "sphere",
@@ -87,6 +88,14 @@ def widened(
     sds = ((key, refraction_dpt[key]) for key in ("sd", "j0_sd", "j45_sd"))
     more = {key: math.hypot(sd, more_sd_dpt) for key, sd in sds if isinstance(sd, float)}
     return {**refraction_dpt, **more}
+
+
+def doubt_of(refraction_dpt: Mapping[str, float | str | None] | None) -> tuple[str, ...]:
+    """Return the message about the uncertain refraction of a report; none for a certain or unknown one."""
+    sphere, sd = (None, None) if refraction_dpt is None else (refraction_dpt.get(key) for key in ("sphere", "sd"))
+    if not isinstance(sphere, float) or not isinstance(sd, float) or (abs(sphere) <= FAR_DPT and sd <= MAX_SD_DPT):
+        return ()
+    return (f"The refraction of {sphere:+.1f} dpt (sd {sd:.1f}) is uncertain.",)
 
 
 def scatter_of(found: Refraction | NoRefraction | None) -> dict[str, float] | None:
