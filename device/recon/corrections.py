@@ -320,8 +320,8 @@ def widened_by_lines(made: Reconstruction, faults: Mapping[str, float]) -> Recon
 
 def _widened(report: Report, more_sd_dpt: float) -> Report:
     """Return a report whose refraction has one more standard deviation, with the message about an uncertain one."""
-    eye_dpt, said = widened(report.refraction_dpt, more_sd_dpt), doubt_of(report.refraction_dpt)
-    warnings = (*(words for words in report.warnings if words not in said), *doubt_of(eye_dpt))
+    eye_dpt, doubted = widened(report.refraction_dpt, more_sd_dpt), doubt_of(report.refraction_dpt)
+    warnings = (*(words for words in report.warnings if words not in doubted), *doubt_of(eye_dpt))
     return replace(report, refraction_dpt=eye_dpt, warnings=warnings)
 
 

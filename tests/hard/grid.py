@@ -28,7 +28,7 @@ EYES = (
 DRAWN_DPT = 4.0  # drawn eyes have a mean sphere between minus and plus that
 QUICK_MERGED, QUICK_COLUMNS = (
     4,
-    (DEFAULT_SCHEDULE, "gradient", PEER),
+    (DEFAULT_SCHEDULE, "tikhonov", PEER),
 )  # of one eye: within a minute on a laptop
 QUICK = (
     "1.0% saturated",

@@ -22,6 +22,9 @@ MIN_SCATTER = 5.0  # standard deviations of the frames' correlations below their
 FEWEST = 3  # frames that show which one is blurred
 MIN_COPY, MIN_COPY_SD = 0.25, 8.0  # correlation of a second copy: still eyes 0.2 and less, NUMERICS.md 9.1
 MIN_COPIED = 0.5  # of the power that the others explain of a usual frame: other retinas 0.35 and less
+MAX_USUAL = (
+    0.99  # of a usual correlation: a jump of 1 degree 0.984; in small frames a still eye may seem to have a copy
+)
 OTHER = "does not show what the other frames show"
 IN_PART = "shows in part only what the other frames show: a lid, or a second image over it"
 LESS_SHARP = "is less sharp than the other frames: out of focus, or a second image over it"
@@ -111,6 +114,8 @@ def _moved_words(registrar: Registrar, one: _Compared, typical: float) -> str | 
     `typical` is the correlation of a usual frame with the others.
     """
     found = replace(one.registration, shift_px=one.left_px)
+    if found.correlation > MAX_USUAL * typical:
+        return None
     copy = registrar.register(one.others, registrar.rest(one.others, one.detail, found))
     explained = found.correlation**2 + (1 - found.correlation**2) * copy.correlation**2
     if copy.correlation < max(MIN_COPY, MIN_COPY_SD * copy.sd) or explained < MIN_COPIED * typical**2:
