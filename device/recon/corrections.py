@@ -155,12 +155,19 @@ class Corrections:
             The steps before a picture.
         """
         best = Solution(run, made)
-        if run.joined is None and not run.done.is_closed_form:
-            best = yield from self._without_flicker(best)
+        if run.joined is not None or run.done.is_closed_form:
+            best = yield from self._without_spots(best)
+            return best.picture
+        best = yield from self._without_flicker(best)
+        steady = best.run
+        best = yield from self._in_even_light(best)
+        is_cut = best.run is steady and _is_cut(steady)
+        if is_cut:
+            best = yield from self._behind_pupil(best)
+        if best.run is steady:  # stray light that was taken out in part, and a pupil, leave light like that of a ghost
             best = yield from self._without_ghost(best)
-            best = yield from self._in_even_light(best)
         best = yield from self._without_spots(best)
-        if run.joined is None and not run.done.is_closed_form:
+        if not is_cut:
             best = yield from self._behind_pupil(best)
         return best.picture
 
@@ -282,7 +289,7 @@ class Corrections:
         run, residual = whole.run, whole.made.report.residual
         if run.asked.rounds is not None:  # fewer rounds leave a larger residual
             return whole
-        is_cut = isinstance(run.refraction, NoRefraction) and run.refraction.is_cut
+        is_cut = _is_cut(run)
         is_explained = residual is None or residual <= MAX_EXPLAINED
         if self._solve_behind_pupil is None or (is_explained and not is_cut):
             return whole
@@ -323,6 +330,11 @@ def _widened(report: Report, more_sd_dpt: float) -> Report:
     eye_dpt, doubted = widened(report.refraction_dpt, more_sd_dpt), doubt_of(report.refraction_dpt)
     warnings = (*(words for words in report.warnings if words not in doubted), *doubt_of(eye_dpt))
     return replace(report, refraction_dpt=eye_dpt, warnings=warnings)
+
+
+def _is_cut(run: FrameRun) -> bool:
+    """Return whether the refraction was refused because light is missing from the rim of the PSF."""
+    return isinstance(run.refraction, NoRefraction) and run.refraction.is_cut
 
 
 def _unevenness(run: FrameRun) -> float | None:

@@ -147,11 +147,8 @@ class Reconstructor:
         self.lines = LineFinder(self.defects.dark, calibration.sensor.white_dn, calibration.psfs[psf_index])
         self.refractor = None if refractor is None else refractor.result()
         self._refraction_lock = Lock()
-
-        def replan(other: Calibration) -> Reconstructor:
-            rest = recipes, psf_index, True, None, False, methods, audience, field_fixed
-            return Reconstructor(other, shape, planner, clock, *rest)
-
+        plan = partial(Reconstructor, shape=shape, planner=planner, clock=clock, recipes=recipes, psf_index=psf_index)
+        replan = partial(plan, timed=False, methods=methods, audience=audience, field_fixed=field_fixed)
         behind = None if self.refractor is None else partial(_solve_behind_pupil, self, replan)
         self.corrections = Corrections(calibration, shape, self.defects.dark, self._solve, behind, pace)
         self._costs = RefractionCosts(pace)

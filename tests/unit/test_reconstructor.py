@@ -79,7 +79,7 @@ def test_a_quick_look_made_before_is_the_first_stage_of_its_frame() -> None:
     alone, quick = reconstruct(counts()), reconstruct(counts(), quick=True)
     look = reconstruct.quick_look(counts())
     reconstruct.quick_look(counts(1))  # of another frame meanwhile
-    reconstruct.lines = failing  # type: ignore[assignment]
+    reconstruct.lines = failing  # type: ignore[assignment]  # the look has this result: another search fails
     first, *_, made = reconstruct.steps(counts(), look=look)
     assert first is look.stage
     assert isinstance(made, Reconstruction)

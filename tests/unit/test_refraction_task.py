@@ -98,6 +98,7 @@ class RunningClock(VirtualClock):
 def test_a_wait_ends_with_its_deadline_and_the_search_goes_on() -> None:
     estimator, took_s = Estimator(), list[float]()
     frame = np.full((2, 2), 2.0, np.float32), None, None
+    # not a RefractionEstimator, but one whose end this test decides
     task = RefractionTask(estimator, Lock(), RunningClock(), frame, True, took_s.append)  # type: ignore[arg-type]
     for ends_in_time in (task.has_found_by, task.is_done_by):
         assert not ends_in_time(Deadline.after(RunningClock(), 5))
