@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import APIResponse, Route, expect
 
 from tests.browser.conftest import Complaints
 from tests.browser.real import Real
@@ -39,11 +39,11 @@ def test_consent_withdrawn_by_another_client_stops_light(
     complaints.expect("409")
     page = open_page(real.url)
     new_person(page)
-    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false", timeout=15_000)
+    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false")
     visit, kept = visit_of(page), len(real.rig.store.captures(500))
     set_consent(real, visit, value)
     words, on_the_button = WORDS[value]
-    expect(page.locator(".prompt .state-bar")).to_contain_text(words, timeout=10_000)
+    expect(page.locator(".prompt .state-bar")).to_contain_text(words)
     expect(page.locator(SHUTTER)).to_contain_text(on_the_button)
     expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "true")
     expect(page.locator("eye-live[data-frame]")).to_have_count(0)
@@ -62,12 +62,42 @@ def test_consent_withdrawn_by_another_client_stops_light(
         page.wait_for_selector("[data-screen=outcome]")
 
 
+def test_answer_from_before_the_consent_was_recorded_does_not_undo_it(open_page: Open, real: Real) -> None:
+    """The aiming screen reads the visit while the consent is on its way, and gets the older answer last."""
+    page = open_page(real.url)
+    tap(page, "#new")
+    page.wait_for_selector("[data-screen=patient]")
+    changes: list[Route] = []
+    answers: list[tuple[Route, APIResponse]] = []
+
+    def hold(route: Route) -> None:
+        if route.request.method == "PATCH":
+            changes.append(route)
+        elif changes and not answers:
+            answers.append((route, route.fetch()))
+        else:
+            route.continue_()
+
+    page.route(f"**/api/visits/{visit_of(page)}", hold)
+    tap(page, "[data-value=agreed]")
+    page.wait_for_selector("[data-screen=aim]")
+    with page.expect_response(lambda response: response.request.method == "PATCH"):
+        changes[0].continue_()
+    page.wait_for_selector("eye-live[data-frame]")
+    with page.expect_response(lambda response: response.request.method == "GET"):  # it asks again
+        ((route, answer),) = answers
+        route.fulfill(response=answer)
+    assert answer.json()["fields"].get("consent") is None
+    page.wait_for_timeout(500)
+    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false")
+
+
 def test_capture_refused_without_consent_shows_alert(open_page: Open, real: Real, complaints: Complaints) -> None:
     """The page still shows consent, because its preview request hangs; the capture request is refused."""
     complaints.expect("409")
     page = open_page(real.url)
     new_person(page)
-    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false", timeout=15_000)
+    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false")
     page.route("**/api/preview**", lambda route: None)
     page.wait_for_timeout(3000)
     visit, kept = visit_of(page), len(real.rig.store.captures(500))

@@ -19,13 +19,35 @@ export async function alertOnError(task) {
 
 const visitUrl = (visit, what) => `/api/visits/${encodeURIComponent(visit)}${what ? `/${what}` : ""}`;
 
-function storeVisit(visit) {
-  if (visit && get().route.visit === visit.id) set({ visit: withUnsaved(Object.freeze(visit)) });
-  return visit;
-}
+let changesAnswered = 0;
+const newestReads = new Map(); // of each visit
 
-/** Reload a visit. */
-export const refreshVisit = (id) => alertOnError(async () => storeVisit(await getVisit(id)));
+const storeVisit = (visit) => {
+  if (get().route.visit === visit.id) set({ visit: withUnsaved(Object.freeze(visit)) });
+  return visit;
+};
+
+/** Store the visit that the server returned after a change. */
+const storeChanged = (visit) => {
+  changesAnswered += 1;
+  return storeVisit(visit);
+};
+
+/**
+ * Reload a visit. What the server read before a change that was answered meanwhile is out of date and is read again;
+ * of several readings at the same time only the last one counts.
+ */
+export const refreshVisit = (id) =>
+  alertOnError(async () => {
+    const read = {};
+    newestReads.set(id, read);
+    for (;;) {
+      const before = changesAnswered;
+      const visit = await getVisit(id);
+      if (newestReads.get(id) !== read) return visit;
+      if (before === changesAnswered) return storeVisit(visit);
+    }
+  });
 
 const MONTAGE_POLL_MS = 2000; // a montage takes some seconds, and waits while the camera is used
 let montagePoll = 0;
@@ -116,7 +138,7 @@ async function sendUnsaved() {
     try {
       const result = await send("PATCH", visitUrl(visit), body);
       unsaved = unsaved.filter((other) => other !== change);
-      storeVisit(result);
+      storeChanged(result);
     } catch (problem) {
       if (!(problem instanceof ApiError)) throw problem;
       if (problem.code === "link.cut") return; // repeated when the connection is back
@@ -130,7 +152,7 @@ async function sendUnsaved() {
 // ---- slots
 
 const change = (what, body) =>
-  alertOnError(async () => storeVisit(await send("POST", visitUrl(get().route.visit, what), body)));
+  alertOnError(async () => storeChanged(await send("POST", visitUrl(get().route.visit, what), body)));
 
 /** Mark a slot as "could not"; a chip offers undo for ten seconds. */
 export async function notPossible(slot, reason) {
@@ -149,7 +171,7 @@ export async function undoNotPossible({ visit, slot, before }) {
   lowerAlert("shot.crossed");
   const result = await alertOnError(() => send("POST", visitUrl(visit, "slots"), { slot, capture: before }));
   if (!result) return;
-  storeVisit(result);
+  storeChanged(result);
   navigate({ screen: "aim", visit, slot });
 }
 
@@ -170,7 +192,7 @@ export async function moveToOtherEye(slot, capture) {
   if (!to) return;
   const visit = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: to.eye }));
   if (!visit) return;
-  storeVisit(visit);
+  storeChanged(visit);
   moveCapture(capture, to);
   navigate({ screen: "picture", visit: visit.id, slot: to.id, capture });
 }
