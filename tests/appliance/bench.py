@@ -69,14 +69,14 @@ class Bench:
         with (self.here / "service.log").open("ab") as log:
             service = subprocess.Popen(words, stdout=log, stderr=log, start_new_session=True)
         try:
-            end = time.monotonic() + 10
+            end = time.monotonic() + 60
             while subprocess.run([*self.rauc(), "status"], capture_output=True).returncode:
                 assert time.monotonic() < end, (self.here / "service.log").read_text()
                 time.sleep(0.02)
             yield service
         finally:
             service.terminate()
-            service.wait(10)
+            service.wait(60)
 
     def boot(self) -> str:
         """Emulate the firmware after an orderly restart; return the slot that runs."""
@@ -127,7 +127,7 @@ def opened(here: Path, workshop: Workshop, slot_kb: int = SLOT_KB) -> Iterator[B
         for loop in bench.loops.values():
             subprocess.run(["losetup", "-d", loop], check=False)
         daemon.terminate()
-        daemon.communicate(timeout=10)
+        daemon.communicate(timeout=60)
 
 
 def clear(bench: Bench) -> None:

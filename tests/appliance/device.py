@@ -118,12 +118,12 @@ class Device:
         finally:
             if nspawn.poll() is None:
                 os.kill(pid if pid > 0 else nspawn.pid, SIGKILL)  # the first process inside; all others end with it
-            nspawn.wait(20)
+            nspawn.wait(60)
             if word >= 0:
                 self.tried = nspawn.returncode == 133 and "tryboot" in _read_at(word, "reboot-param")
                 os.close(word)
 
-    def restarts(self, machine: Machine, patience_s: float = 180.0) -> None:
+    def restarts(self, machine: Machine, patience_s: float = 300.0) -> None:
         """Wait until the machine is off."""
         end = time.monotonic() + patience_s
         while machine.is_on():

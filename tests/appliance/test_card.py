@@ -20,7 +20,7 @@ from services.update.bootchooser import PARTITIONS, BootChooser
 from tests.appliance.device import FOLDERS, run
 from tests.project_files import ROOT
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.systemd
 
 IMAGE = ROOT / "systemd" / "image"
 CARD = IMAGE / "card"

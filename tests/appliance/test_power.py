@@ -32,7 +32,7 @@ from tests.appliance.bench import NOWHERE, Bench
 from tests.hard.power import Disk, record_calls, write_tree
 from tests.project_files import ROOT
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.systemd
 
 SLOT_KB, NOISE_BYTES = 96, 60_000
 DRAWS = 12

@@ -38,7 +38,7 @@ from tests.appliance.releases import Workshop
 from tests.project_files import ROOT
 from tests.site import identity, serve, signed
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.systemd
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from tests.appliance.device import Device, factory_new
 from tests.appliance.releases import BROKEN, IMPATIENT, Workshop
 from tests.systemd.machine import Machine
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.systemd
 
 PYTHON = "/opt/diffuscope/.venv/bin/python"
 DIFFUSCOPE = "/opt/diffuscope/.venv/bin/diffuscope"

@@ -19,7 +19,6 @@ from tests.journey.asking import MAX_BYTES
 from tests.journey.conftest import until
 
 NORMAL_C, CHARGED = 25.0, BatteryState(0.775, 3.88)
-SOON_MS = 15_000  # the status interval of 1 s, and a busy computer
 End = Callable[[], None]
 Cause = Callable[[Real, str], End]  # of an instrument and a visit: cause the alert, return the function that ends it
 
@@ -232,7 +231,7 @@ class StandingAlerts:
         visit = next((candidate["id"] for candidate in visits if not candidate["finished_at"]), None)
         visit = visit or real.begin_visit(consent="agreed", sex="woman", age=54)["id"]
         page.goto(f"{real.url}/#/visit/{visit}/aim/R-centre")
-        expect(page.locator(f"[data-code='{code}']")).to_have_count(1, timeout=SOON_MS)
+        expect(page.locator(f"[data-code='{code}']")).to_have_count(1)
 
 
 @contextmanager
@@ -240,10 +239,10 @@ def alert(real: Real, page: Page, code: str) -> Iterator[None]:
     """Cause an alert on a page that aims, and end it after the context."""
     end = CAUSES[code](real, visit_of(page))
     shown = page.locator(f"[data-code='{code}']")
-    expect(shown).to_have_count(1, timeout=SOON_MS)
+    expect(shown).to_have_count(1)
     yield
     end()
     if code.startswith("consent."):
         page.reload()
-    expect(shown).to_have_count(0, timeout=SOON_MS)
+    expect(shown).to_have_count(0)
     page.wait_for_selector("eye-live[data-frame]")

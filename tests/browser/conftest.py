@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, expect, sync_playwright
 
 from tests.browser.alert_causes import StandingAlerts
 from tests.browser.real import Instruments, Real
@@ -26,6 +26,8 @@ PLANS = ROOT / "out" / "browser-plans"  # cached FFT plans and timings of this c
 SMALL_PLANS = PLANS.with_name("browser-plans-small")  # the same for heads with a small sensor
 CHROMIUM = "/usr/bin/chromium-headless-shell"
 TABLET = (1280, 800)
+PATIENCE_MS = 60_000  # ends a test that waits in vain; on a busy machine all takes several times as long
+expect.set_options(timeout=PATIENCE_MS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -226,7 +228,7 @@ def open_page(browser: Browser, complaints: Complaints, undo: ExitStack) -> Iter
         settings = {"viewport": {"width": width, "height": height}, "has_touch": True, "is_mobile": True, **options}
         contexts.append(browser.new_context(**settings))  # type: ignore[arg-type]
         page = contexts[-1].new_page()
-        page.set_default_timeout(15_000)
+        page.set_default_timeout(PATIENCE_MS)
         complaints.watch(page)
         page.goto(url)
         return page

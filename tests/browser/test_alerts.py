@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.alert_causes import CAUSES, SOON_MS, StandingAlerts, alert, cut_power
+from tests.browser.alert_causes import CAUSES, StandingAlerts, alert, cut_power
 from tests.browser.axe import axe_faults
 from tests.browser.conftest import Complaints, MakeReal
 from tests.browser.looks import SIZES, look_for_faults
@@ -107,7 +107,7 @@ def test_one_blocking_alert_and_two_chips_by_priority(open_page: Open, make_real
     real = make_real(weeks_old=30.0)
     page = aiming(open_page, real)
     chips = page.locator(".notices li")
-    expect(page.locator("[data-code='cal.old']")).to_have_count(1, timeout=SOON_MS)
+    expect(page.locator("[data-code='cal.old']")).to_have_count(1)
     with alert(real, page, "heat.warm"), alert(real, page, "batt.empty"):
         expect(page.locator("[data-code='cal.old']")).to_have_count(1)
         with alert(real, page, "store.low"), alert(real, page, "light.fault"):

@@ -300,7 +300,7 @@ def test_fast_tapping_on_real_server(open_page: Open, server: Server, complaints
     new_person(page)
     for _ in range(12):  # a busy computer may cut the light: the slot is then requested again
         tap(page, f"{SHUTTER}[aria-disabled=false]")
-        page.wait_for_selector("[data-phase=assessed], [data-phase=kept], .state-bar", timeout=60_000)
+        page.wait_for_selector("[data-phase=assessed], [data-phase=kept], .state-bar")
         if page.locator(".state-bar, [data-screen=aim]").count():
             continue
         stay(page)
@@ -308,5 +308,5 @@ def test_fast_tapping_on_real_server(open_page: Open, server: Server, complaints
             break
         tap(page, "#next")
     tap(page, "#next[aria-disabled=false]")  # its text is Finish when all slots are taken
-    expect(page.locator(".outcome .verdict")).to_contain_text("The pictures are kept", timeout=60_000)
+    expect(page.locator(".outcome .verdict")).to_contain_text("The pictures are kept")
     expect(page.locator(".tiles [data-face=good]")).to_have_count(4)

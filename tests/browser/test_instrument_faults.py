@@ -15,30 +15,28 @@ from tests.journey.faults import wait_until_idle
 
 pytestmark = pytest.mark.browser
 
-SOON_MS = 15_000  # the status interval of 1 s, and a busy computer
-
 
 def aiming(open_page: Open, real: Real, slot: str = "R-centre") -> Page:
     """Open a page that aims at the first slot of a new patient with consent."""
     page = open_page(real.url)
     tap(page, "#new")
     agree(page)
-    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false", timeout=SOON_MS)
+    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false")
     return page
 
 
 def expect_blocking(page: Page, code: str, words: str, on_the_button: str) -> None:
-    expect(page.locator(f".state-bar[data-code='{code}']")).to_contain_text(words, timeout=SOON_MS)
+    expect(page.locator(f".state-bar[data-code='{code}']")).to_contain_text(words)
     expect(page.locator(SHUTTER)).to_contain_text(re.compile(on_the_button))
     expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "true")
 
 
 def expect_chip(page: Page, code: str, words: str) -> None:
-    expect(page.locator(f".notices [data-code='{code}']")).to_contain_text(re.compile(words), timeout=SOON_MS)
+    expect(page.locator(f".notices [data-code='{code}']")).to_contain_text(re.compile(words))
 
 
 def expect_ended(page: Page, code: str) -> None:
-    expect(page.locator(f"[data-code='{code}']")).to_have_count(0, timeout=SOON_MS)
+    expect(page.locator(f"[data-code='{code}']")).to_have_count(0)
 
 
 def test_temperature_and_battery_alerts_begin_and_end(open_page: Open, real: Real) -> None:
@@ -156,9 +154,9 @@ def test_a_page_that_only_shows_pictures_leaves_the_camera(open_page: Open, real
 def test_control_is_released_when_page_closes(open_page: Open, real: Real) -> None:
     first = aiming(open_page, real)
     second = open_page(f"{real.url}/#/visit/{visit_of(first)}/aim/R-centre")
-    expect(second.locator(".state-bar[data-code='link.other']")).to_be_visible(timeout=SOON_MS)
+    expect(second.locator(".state-bar[data-code='link.other']")).to_be_visible()
     first.goto("about:blank")
-    expect(second.locator(".state-bar")).to_have_count(0, timeout=8_000)
+    expect(second.locator(".state-bar")).to_have_count(0)
     take_picture(second)
 
 

@@ -56,7 +56,7 @@ def press(page: Page, complaints: Complaints, how: Callable[[], None]) -> None:
         after_debounce(page)
         how()
         stay(page)
-        page.wait_for_selector("[data-phase=kept], [data-screen=aim]", timeout=30_000)
+        page.wait_for_selector("[data-phase=kept], [data-screen=aim]")
         if page.locator("[data-phase=kept]").count():
             return
         page.wait_for_timeout(1500)
@@ -168,7 +168,7 @@ def test_press_during_other_captures_shows_busy_alert(page: Page, complaints: Co
     expect(page.get_by_role("status")).to_contain_text("A picture is being taken")
     page.locator(SHUTTER).tap(force=True)
     expect(page.locator("[data-code=busy]")).to_contain_text("Wait until it is done")
-    expect(page.locator(".state")).to_have_text("Ready", timeout=60_000)
+    expect(page.locator(".state")).to_have_text("Ready")
 
 
 def test_frozen_server_alert_begins_within_5_s_and_ends_within_3_s(

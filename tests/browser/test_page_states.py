@@ -225,15 +225,15 @@ def test_old_live_frame_shows_its_age(open_page: Open, real: Real) -> None:
     real.clock.gate.set()
     expect(page.locator("eye-live .age")).to_be_hidden()
     page.route("**/api/preview?*", lambda route: None)
-    expect(page.locator("[data-code='link.slow']")).to_contain_text(re.compile(r"\d s late"), timeout=10_000)
+    expect(page.locator("[data-code='link.slow']")).to_contain_text(re.compile(r"\d s late"))
     page.unroute("**/api/preview?*")
-    expect(page.locator("[data-code='link.slow']")).to_have_count(0, timeout=10_000)
+    expect(page.locator("[data-code='link.slow']")).to_have_count(0)
 
 
 def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     real.rig.block_exposures()  # the camera gives no frame; the server answers in time
-    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[4-9]\.\d s old$"), timeout=15_000)
+    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[4-9]\.\d s old$"))
     expect(page.locator("[data-code='link.slow']")).to_have_count(0)
     tap(page, "#not-possible")
     expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")

@@ -56,7 +56,7 @@ def test_home_links_to_upload_queue(open_page: Open, queue: Queue) -> None:
     page.wait_for_selector(".send .people li")
     queue.receiver.answers = {}
     queue.receiver.gate.set()
-    expect(page.locator(".send [aria-live]")).to_contain_text("Nothing waits to be sent.", timeout=15_000)
+    expect(page.locator(".send [aria-live]")).to_contain_text("Nothing waits to be sent.")
     expect(page.locator("#try-now")).to_have_count(0)
     assert len(queue.receiver.kept) == 3
 

@@ -142,7 +142,7 @@ def test_capture_is_recomputed_and_time_limit_is_stored(technician_page: Page) -
     assert plot.evaluate("plot => plot.naturalWidth") == PLOT_PX
     technician_page.locator("tbody tr", has_text="variation").get_by_role("button").tap()
     kept, again = technician_page.locator("eye-pic").nth(0), technician_page.locator("eye-pic").nth(1)
-    expect(again).to_have_attribute("data-mark", "final", timeout=60_000)
+    expect(again).to_have_attribute("data-mark", "final")
     technician_page.get_by_role("button", name="2×").tap()
     expect(again).to_have_attribute("data-zoom", "2.00")
     again.focus()
@@ -218,7 +218,7 @@ def test_a_passphrase_is_set_before_the_first_backup(technician_page: Page) -> N
     assert layout_faults(technician_page, "instrument-backup form") == []
     second.fill("four plain words here")
     section.get_by_role("button").tap()
-    expect(section.get_by_role("note")).to_contain_text("The passphrase is set.", timeout=30_000)
+    expect(section.get_by_role("note")).to_contain_text("The passphrase is set.")
     section.locator("#back-up").tap()
     expect(section.get_by_role("note")).to_contain_text("stick")
     assert layout_faults(technician_page, "#back-up") == []

@@ -437,7 +437,7 @@ def test_control_is_taken_from_another_screen(open_page: Open, real: Real, compl
     expect(second.locator(SHUTTER)).to_contain_text("Other screen")
     second.locator("[data-do=useHere]").tap()
     expect(second.locator(SHUTTER)).to_contain_text("Take picture")
-    expect(first.locator(SHUTTER)).to_contain_text("Other screen", timeout=15_000)
+    expect(first.locator(SHUTTER)).to_contain_text("Other screen")
     expect(first.locator("eye-live[data-frame]")).to_have_count(0)
 
 

@@ -109,7 +109,7 @@ def double_tap(page: Page, x: float, y: float) -> None:
 
 def wait_until_drawn(page: Page, tools: str, which: str = "#picture") -> None:
     """Wait until the final picture is drawn with these tools ("red-free 0 1": brightness, contrast)."""
-    expect(page.locator(which)).to_have_attribute("data-drawn", f"final {tools}", timeout=20_000)
+    expect(page.locator(which)).to_have_attribute("data-drawn", f"final {tools}")
 
 
 def loupe_position(pic: Locator) -> tuple[float, float]:

@@ -89,7 +89,7 @@ class Machine:
         send = f"import os, time; print(time.monotonic(), flush=True); os.kill({self.main_pid()}, {int(number)})"
         return float(self.run("python3", "-c", send, check=False))
 
-    def until(self, holds: Callable[[], bool], patience_s: float = 30.0) -> None:
+    def until(self, holds: Callable[[], bool], patience_s: float = 120.0) -> None:
         end = time.monotonic() + patience_s
         while not holds():
             assert time.monotonic() < end, f"it never happened{self.journal()}"
@@ -167,10 +167,10 @@ def boot_tree(tree: Path, console: Path, *more: str) -> Iterator[Machine]:
         )
         yield machine
         machine.run("systemctl", "poweroff", "--force")
-        nspawn.wait(20)
+        nspawn.wait(60)
     finally:
         nspawn.terminate()
-        nspawn.wait(20)
+        nspawn.wait(60)
 
 
 def boot_until_power_cut(tree: Path, console: Path, when: Callable[[], bool], *more: str) -> None:
@@ -178,15 +178,15 @@ def boot_until_power_cut(tree: Path, console: Path, when: Callable[[], bool], *m
     nspawn = _start_nspawn(tree, console, more)
     try:
         leader_pid = leader(nspawn, console)
-        end = time.monotonic() + 30
+        end = time.monotonic() + 120
         while not when():
             assert time.monotonic() < end, f"it never happened: {console.read_text()}"
             time.sleep(0.001)
         os.kill(leader_pid, SIGKILL)  # the first process inside; all others end with it
-        nspawn.wait(20)
+        nspawn.wait(60)
     finally:
         nspawn.terminate()
-        nspawn.wait(20)
+        nspawn.wait(60)
 
 
 def _start_nspawn(tree: Path, console: Path, more: tuple[str, ...]) -> subprocess.Popen[bytes]:

@@ -15,7 +15,7 @@ import pytest
 from tests.project_files import ROOT
 from tests.systemd.machine import Machine, boot_tree, boot_until_power_cut, installed, root
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.systemd
 
 UNIT = "diffuscope-identity.service"
 SHIPPED = {

@@ -14,7 +14,7 @@ from tests.receiver import KEY
 from tests.site import identity
 from tests.systemd.machine import UNIT, Machine, booted
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.systemd
 
 PORT = 8443
 ASK = """

@@ -16,7 +16,7 @@ import pytest
 from tests.appliance.device import run
 from tests.systemd.machine import UNIT, Blanked, Machine, booted
 
-pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
+pytestmark = pytest.mark.systemd
 
 LAMP = ["--device", "/dev/spidev0.0"]
 BUS = "--bind=/dev/null:/dev/spidev0.0"  # nothing writes to it: the recorder ends before
