@@ -7,7 +7,7 @@ from statistics import median, median_low
 WINDOW = 200  # durations: the next one is longer than the second largest in one of a hundred runs
 QUANTILE = 0.99
 STALL = 8.0  # times the median: the machine was occupied during one step; beside a steady load at most 5
-FORGET = 0.995  # of a step that is skipped: half of its estimate after 138 skips
+FORGET = 0.997  # of a step that is skipped: half of its estimate after 231 skips, and whole again after one run
 LEAST_RUNS = 3  # of which the median leaves out a stall
 PACE_WINDOW = 11
 LEAST_S = 1e-6
@@ -45,18 +45,23 @@ class DurationEstimate:
     def __init__(self, pace: Pace) -> None:
         self._pace = pace
         self._seen: deque[float] = deque(maxlen=WINDOW)
+        self._share = 1.0  # of the quantile, after skips
 
     def add(self, seconds: float) -> None:
         """Add the duration of one run."""
         self._seen.append(seconds / self._pace.seconds)
+        self._share = 1.0
 
     @property
     def seconds(self) -> float:
-        """Quantile of 99 %: the second largest of 200 durations, the largest of fewer; 0.0 before the first run."""
+        """Quantile of 99 %: the second largest of 200 durations, the largest of fewer; 0.0 before the first run.
+
+        Less after skips, but at least the median.
+        """
         if not self._seen:
             return 0.0
         rank = min(ceil(QUANTILE * (len(self._seen) + 1)), len(self._seen))
-        return self._pace.seconds * sorted(self._seen)[rank - 1]
+        return max(self._share * self._pace.seconds * sorted(self._seen)[rank - 1], self.typical_s)
 
     @property
     def typical_s(self) -> float:
@@ -70,8 +75,9 @@ class DurationEstimate:
     def skipped(self, usually_fits: bool) -> None:
         """Reduce the estimate after the step was skipped for want of time: it records no duration.
 
-        One or two durations are halved, and a stall is forgotten. More durations shrink by 0.5 % where the step usually
-        fits, so that it is tried again; where it does not, the time is too short and nothing is wrong.
+        One or two durations are halved, and a stall is forgotten. Of more durations the quantile shrinks by 0.3 % where
+        the step usually fits, until one run, so that it is tried once; where it does not, the time is too short and
+        nothing is wrong.
 
         Parameters
         ----------
@@ -83,7 +89,7 @@ class DurationEstimate:
         elif (largest := max(self._seen)) > STALL * median_low(self._seen):
             self._seen.remove(largest)
         elif usually_fits:
-            self._seen = deque((FORGET * ratio for ratio in self._seen), WINDOW)
+            self._share *= FORGET
 
 
 class RefractionCosts:

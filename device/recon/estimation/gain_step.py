@@ -64,15 +64,27 @@ def find_gain_step(bands: Image) -> GainStep | None:
     if not enough.any():
         return None
     shares, lit, seen, places = shares[:, enough], lit[:, enough], seen[enough], places[enough]
-    step = np.nanmedian(np.where(lit, shares, np.nan), axis=0)
-    spread = np.nanmedian(np.where(lit, np.abs(shares - step), np.nan), axis=0) / NORMAL
+    step = _median(shares, lit)
     size = np.abs(step)
-    is_sure = size > np.maximum(MIN_SHARE, MIN_SURE * spread * np.sqrt(np.pi / 2 / seen))
+    large = size > MIN_SHARE
+    if not large.any():
+        return None
+    spread = _median(np.abs(shares - step)[:, large], lit[:, large]) / NORMAL
+    is_sure = large.copy()
+    is_sure[large] = size[large] > MIN_SURE * spread * np.sqrt(np.pi / 2 / seen[large])
     best = int(np.argmax(np.where(is_sure, size, 0)))
     away = np.abs(places - places[best])
     near = size[(away > 2 * span) & (away <= NEAR * span)].max(initial=0.0)
     is_step = is_sure[best] and MIN_RATIO * near < size[best] < MAX_SHARE
     return GainStep(int(places[best]), float(step[best] / (1 - step[best] / 2))) if is_step else None
+
+
+def _median(values: Series, lit: NDArray[np.bool_]) -> Series:
+    """Return the median over the lit bands at each place, (places,); numpy's without NaN takes five times as long."""
+    rising = np.sort(np.where(lit, values, np.inf), axis=0)
+    last = lit.sum(axis=0)[None] - 1
+    middle = [np.take_along_axis(rising, index, axis=0)[0] for index in (last // 2, (last + 1) // 2)]
+    return np.asarray(sum(middle) / 2)
 
 
 def _steps(bands: Series, places: NDArray[np.intp], span: int) -> tuple[Series, NDArray[np.bool_]]:

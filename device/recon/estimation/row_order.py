@@ -42,8 +42,10 @@ class RowOrder:
     def __init__(self, psf_bins: Image) -> None:
         light = psf_bins.mean(axis=1)
         spread = float((light > MIN_LIGHT * light.max()).mean())
-        steepest = _jumps(psf_bins, 0.0).max(axis=1, initial=0.0) if spread >= MIN_SPREAD else float("inf")
-        self._min_jumps = np.maximum(MIN_JUMPS, steepest)[:, None]
+        self._min_jumps = np.full(2, np.inf)
+        if spread >= MIN_SPREAD:
+            steepest = [_jumps(psf_bins, 0.0, of_shares).max(initial=0.0) for of_shares in (False, True)]
+            self._min_jumps = np.maximum(MIN_JUMPS, steepest)
 
     def __call__(self, counts: Pixels, bins: Image, likeness: Image, unknown: Image) -> None:
         """Raise FrameError if rows of a frame (rows, cols) of at least MIN_ROWS are repeated or missing.
@@ -56,9 +58,12 @@ class RowOrder:
         if rows.size >= MIN_REPEATED * len(bins):
             raise FrameError(_words(rows), ROWS_REMEDY)
         jumps = _jumps(bins, EVEN)
-        places = np.flatnonzero((jumps > self._min_jumps).all(axis=0))
+        places = np.flatnonzero(jumps > self._min_jumps[0])
         if places.size:
-            row = int(places[np.argmax(jumps[0, places])]) + _span(len(bins))
+            jumps_of_shares = _jumps(bins, EVEN, of_shares=True)
+            places = places[jumps_of_shares[places] > self._min_jumps[1]]
+        if places.size:
+            row = int(places[np.argmax(jumps[places])]) + _span(len(bins))
             raise FrameError(f"rows are missing or at a wrong place from row {row} on", ROWS_REMEDY)
 
 
@@ -78,7 +83,8 @@ def _repeated(counts: Pixels, bins: Image, likeness: Image, unknown: Image) -> M
     if texture < MAX_TEXTURE:
         found[1:] = (likeness > texture + MIN_LIKENESS) & (usable & lit)[1:]
     first: dict[bytes, int] = {}
-    for i in np.flatnonzero(usable):
+    _, group, members = np.unique(light, return_inverse=True, return_counts=True)
+    for i in np.flatnonzero(usable & (members[group] > 1)):
         k = first.setdefault(bins[i].tobytes(), int(i))
         if k < i and np.array_equal(counts[i], counts[k]) and np.unique(counts[i]).size >= MIN_VALUES:
             found[i] = True
@@ -89,30 +95,31 @@ def _span(rows: int) -> int:
     return max(3, rows // SPANS)
 
 
-def _jumps(bins: Image, even: float) -> Series:
-    """Return how much more the means of the rows above and below each place differ than near it, (2, places).
+def _jumps(bins: Image, even: float, of_shares: bool = False) -> Series:
+    """Return how much more the means of the rows above and below each place differ than near it, (places,).
 
-    As they are, and in shares of the light of each row's segment, in which a gain of some rows is no jump; the SEEN-th
+    As they are, or in shares of the light of each row's segment, in which a gain of some rows is no jump; the SEEN-th
     largest of the segments. A place is a row with `_span` rows above it, from the first such row on. 0 where rows are
     not lit, or where one of those that are compared has less than `even` of the light of the brightest.
     """
     span = _span(len(bins))
     if len(bins) < 8 * span or bins.shape[1] < SEGMENTS:
-        return np.zeros((2, 0))
+        return np.zeros(0)
     light = bins.mean(axis=1)
     floor = MIN_LIGHT * max(float(light.max()), FAINT)
     width = bins.shape[1] // SEGMENTS
     parts = bins[:, : SEGMENTS * width].reshape(len(bins), SEGMENTS, width)
-    bright = np.maximum(parts.mean(axis=2, keepdims=True), np.float32(floor))
-    left = np.array([_steps(rows, span) for rows in (parts, parts / bright)])
-    padded = np.pad(left, ((0, 0), (0, 0), (3 * span, 3 * span)), mode="edge")
-    largest = ndimage.maximum_filter1d(padded, 2 * span + 1, axis=2)
-    places = left.shape[2]
-    near = np.maximum(largest[..., span : span + places], largest[..., 5 * span : 5 * span + places])
+    if of_shares:
+        parts = parts / np.maximum(parts.mean(axis=2, keepdims=True), np.float32(floor))
+    left = _steps(parts, span)
+    padded = np.pad(left, ((0, 0), (3 * span, 3 * span)), mode="edge")
+    largest = ndimage.maximum_filter1d(padded, 2 * span + 1, axis=1)
+    places = left.shape[1]
+    near = np.maximum(largest[:, span : span + places], largest[:, 5 * span : 5 * span + places])
     windows = np.lib.stride_tricks.sliding_window_view(light, places).T  # (places, 2 span)
     least, most = windows.min(axis=1), windows.max(axis=1)
     lit = (least > floor) & (least >= even * most) & (near > 0)
-    return np.sort(np.divide(left, near, out=np.zeros_like(left), where=lit), axis=1)[:, -SEEN]
+    return np.asarray(np.sort(np.divide(left, near, out=np.zeros_like(left), where=lit), axis=0)[-SEEN])
 
 
 def _steps(rows: Image, span: int) -> Image:
@@ -120,6 +127,7 @@ def _steps(rows: Image, span: int) -> Image:
 
     `rows`: (rows, segments, bins); the result is (segments, places).
     """
-    count = len(rows) - span + 1
-    means = np.asarray(sum(rows[k : k + count] for k in range(span))) / np.float32(span)
+    sums = np.zeros((len(rows) + 1, *rows.shape[1:]))
+    np.cumsum(rows, axis=0, out=sums[1:])
+    means = np.asarray((sums[span:] - sums[:-span]) / span, np.float32)
     return np.asarray((means[span:] - means[:-span]).var(axis=2).T)

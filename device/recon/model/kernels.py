@@ -402,12 +402,12 @@ def line_sums(counts: Pixels, width: int, bands: Image, bins: Image, texture: Im
     rows, cols = counts.shape
     zero = np.float32(0)
     one = np.float32(1)
-    four = np.float32(4)
-    six = np.float32(6)
     highest = np.float32(3e38)
     segments = texture.shape[1]
+    inner = max(cols - 4, 0)
     row = np.zeros(cols, np.float32)
-    before = np.zeros(cols, np.float32)
+    fine = np.zeros(inner, np.float32)
+    before = np.zeros(inner, np.float32)
     for i in range(rows):
         band = bands[i * len(bands) // rows]
         lost = zero
@@ -418,20 +418,37 @@ def line_sums(counts: Pixels, width: int, bands: Image, bins: Image, texture: Im
             row[j] = value if known else row[j]
             band[j] += row[j]
         for k in range(bins.shape[1]):
+            part = row[k * width : (k + 1) * width]
             total = zero
-            for j in range(k * width, k * width + width):
-                total += row[j]
+            for j in range(width):
+                total += part[j]
             bins[i, k] = total
+        _fourth_differences(row, fine)
         for k in range(segments):
-            own = shared = zero
-            for j in range(2 + k * (cols - 4) // segments, 2 + (k + 1) * (cols - 4) // segments):
-                fine = row[j - 2] - four * row[j - 1] + six * row[j] - four * row[j + 1] + row[j + 2]
-                own += fine * fine
-                shared += fine * before[j]
-                before[j] = fine
-            texture[i, k, 0] = own
-            texture[i, k, 1] = shared
+            begin = k * inner // segments
+            end = (k + 1) * inner // segments
+            texture[i, k, 0] = _product(fine[begin:end], fine[begin:end])
+            texture[i, k, 1] = _product(fine[begin:end], before[begin:end])
+        fine, before = before, fine
         unknown[i] = lost
+
+
+@compiled
+def _fourth_differences(row: Image, out: Image) -> None:
+    """Write the fourth differences of `row` (cols,) to `out` (cols - 4,): a loop of its own is vectorised."""
+    four = np.float32(4)
+    six = np.float32(6)
+    for j in range(out.size):
+        out[j] = row[j] - four * row[j + 1] + six * row[j + 2] - four * row[j + 3] + row[j + 4]
+
+
+@compiled
+def _product(a: Image, b: Image) -> np.float32:
+    """Return the sum of the products of two rows of the same length."""
+    total = np.float32(0)
+    for j in range(a.size):
+        total += a[j] * b[j]
+    return total
 
 
 @compiled
