@@ -5,7 +5,7 @@ screen readers. The marks of each series have their shape and colour; a mark can
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from math import ceil, cos, floor, log10, pi, sin
 
@@ -64,13 +64,17 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """Linear or logarithmic axis of a plot: maps data to 0 (`low`) to 1 (`high`); with its ticks and their labels."""
+    """Linear or logarithmic axis of a plot: maps data to 0 (`low`) to 1 (`high`); with its ticks and their labels.
+
+    `below`: labels of ticks in another unit, in a second line.
+    """
 
     low: float
     high: float
     title: str
     ticks: tuple[tuple[float, str], ...]
     log: bool = False
+    below: tuple[tuple[float, str], ...] = ()
 
     def at(self, value: float) -> float:
         """Return the position of a value: 0 at the low end, 1 at the high end."""
@@ -115,9 +119,16 @@ class Panel:
 LEFT, RIGHT, TOP, BOTTOM = 74, 78, 96, 62
 
 
-def time_axis(seconds: Iterable[float], title: str) -> Axis:
-    """Return a log axis of times in s; a tick below 0.1 s is labelled in milliseconds, others in seconds."""
-    return log_axis(seconds, title, _time)
+def time_axis(seconds: Iterable[float], title: str, fft_pair_s: float | None = None) -> Axis:
+    """Return a log axis of times in s; a tick below 0.1 s is labelled in milliseconds, others in seconds.
+
+    With the duration of an FFT pair in s, each tick has the time in such pairs below.
+    """
+    axis = log_axis(seconds, title, _time)
+    if fft_pair_s is None:
+        return axis
+    pairs = tuple((tick, f"{float(f'{tick / fft_pair_s:.2g}'):g}") for tick, _ in axis.ticks)
+    return replace(axis, below=((pairs[0][0], f"{pairs[0][1]} FFT pairs"), *pairs[1:]))
 
 
 def log_axis(values: Iterable[float], title: str, label: Callable[[float], str]) -> Axis:
@@ -232,7 +243,8 @@ def _frame(plot: Plot) -> list[str]:
     out = []
     for value, words in plot.x.ticks:
         at = _x(plot, value)
-        out += [line(at, TOP, at, low, "grid"), text(at, low + 19, words, "small", "middle")]
+        out += [line(at, TOP, at, low, "grid"), text(at, low + 17, words, "small", "middle")]
+    out += [text(_x(plot, value), low + 31, words, "quiet small", "middle") for value, words in plot.x.below]
     for value, words in plot.y.ticks:
         at = _y(plot, value)
         out += [line(LEFT, at, high, at, "grid"), text(LEFT - 8, at + 4, words, "small", "end")]
@@ -242,7 +254,7 @@ def _frame(plot: Plot) -> list[str]:
             out += [line(high, at, high + 5, at, "frame"), text(high + 8, at + 4, words, "small")]
     middle = (TOP + low) / 2
     out.append(rectangle(LEFT, TOP, high - LEFT, low - TOP, "frame"))
-    out.append(text((LEFT + high) / 2, plot.height - 16, plot.x.title, "", "middle"))
+    out.append(text((LEFT + high) / 2, plot.height - 14, plot.x.title, "", "middle"))
     out.append(_upright(24, middle, plot.y.title))
     if plot.right_title:
         out.append(_upright(plot.width - 14, middle, plot.right_title))

@@ -32,6 +32,7 @@ from device.sim.scene_files import simulate_exposure
 from device.values import Calibration, Image, Mask, Reconstruction
 from services.instrument.measured_frontier import MeasuredFrontier
 from services.plot import Panel
+from services.research.fft_time import pair_s
 from services.research.frontier_light import LightCase, light_case, measure_light, measure_presses
 from services.research.frontier_oracle import best_mus
 from services.research.frontier_plot import draw_frontier, drawn_points, ringed
@@ -175,6 +176,7 @@ def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer
         frame=FrameSize(case.shape[0], case.shape[1]),
         region=bench.region(),
         timing=f"counts in memory to picture on the sensor grid, plans made; {repeats} interleaved repeats",
+        fft_pair_s=pair_s(bench.planner, case.shape, bench.clock),
         edge="seconds_median against psnr_db",
         points=points,
         best_mu=bench.best_mus(),

@@ -6,6 +6,7 @@ from math import log10
 
 from device.recon.methods import METHODS, Method
 from services.plot import Mark, Panel, Plot, Series, log_axis, stacked_svg, time_axis, value_axis
+from services.research.fft_time import pi5_s
 from services.research.frontier_result import Choice, Frontier, Point, PressPoint, pareto_front
 from services.research.frontier_thumbnails import LETTERS, nearest_points
 
@@ -75,7 +76,7 @@ def _time_plot(
         title=f"Accuracy against time{' and light' if found.light else ''}: {found.scene}",
         subtitle=_subtitle(found),
         description=_description(found, edge),
-        x=time_axis([mark.x for mark in marks] + [at for at, _ in limits], _axis_title(found)),
+        x=time_axis([mark.x for mark in marks] + [at for at, _ in limits], _axis_title(found), found.fft_pair_s),
         y=y,
         series=series,
         edge=tuple(edge),
@@ -179,9 +180,10 @@ def _subtitle(found: Frontier) -> str:
     machine = found.machine
     frame = found.frame
     kind = "simulated" if found.simulated else "recorded"
+    pi_ms = 1e3 * pi5_s(1, (frame.rows, frame.cols))
     return (
-        f"{frame.rows} x {frame.cols} pixels, {kind}; {machine.cpu or 'unknown processor'}, "
-        f"one FFT thread; {found.region.what}"
+        f"{frame.rows} x {frame.cols} pixels, {kind}; {machine.cpu or 'unknown processor'}, one FFT thread: "
+        f"{1e3 * found.fft_pair_s:.3g} ms a pair (Raspberry Pi 5: {pi_ms:.2g} ms, not measured)"
     )
 
 
@@ -195,9 +197,9 @@ def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
     )
     return (
         f"Each mark is one method at one bin and one number of rounds: its median time, and its PSNR against the known "
-        f"truth. The best within each time: {best}. Within {found.budget_s:g} s the instrument chooses "
-        f"{choice.method}, bin {choice.bin}, {choice.rounds} rounds: {choice.psnr_db:.1f} dB in "
-        f"{choice.solve_s * 1e3:.0f} ms; {_refraction(found)}."
+        f"truth; scored: {found.region.what}. The best within each time: {best}. "
+        f"Within {found.budget_s:g} s the instrument chooses {choice.method}, bin {choice.bin}, "
+        f"{choice.rounds} rounds: {choice.psnr_db:.1f} dB in {choice.solve_s * 1e3:.0f} ms; {_refraction(found)}."
         + "".join(
             f" A press within {press.budget_s:g} s ({press.choice}): {press.psnr_db:.1f} dB in "
             f"{press.seconds_median * 1e3:.0f} ms."

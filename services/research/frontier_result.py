@@ -188,6 +188,8 @@ class Frontier:
         Part of the picture that is scored.
     timing
         How times were measured, in words.
+    fft_pair_s
+        Duration of one planned FFT pair of the frame's size in s.
     edge
         What the Pareto front is, in words.
     points
@@ -217,6 +219,7 @@ class Frontier:
     frame: FrameSize
     region: ScoredRegion
     timing: str
+    fft_pair_s: float
     edge: str
     points: tuple[Point, ...]
     best_mu: tuple[BestMu, ...]

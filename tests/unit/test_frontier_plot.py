@@ -70,6 +70,7 @@ def measured(
         FrameSize(1080, 1920),
         ScoredRegion("the field", field_known, 9, "", "", 0.02, "", 60.0, (0, 0), 0.2),
         "",
+        0.015,
         "",
         points,
         best,

@@ -71,6 +71,12 @@ def test_labels_do_not_overlap():
             assert abs(y - b) >= 12.8 or x + wide <= a + 0.2 or a + other <= x + 0.2
 
 
+def test_ticks_of_a_time_axis_are_also_in_fft_pairs():
+    axis = time_axis([0.011, 0.09], "time", fft_pair_s=0.02)
+    assert [words for _, words in axis.ticks] == ["10 ms", "20 ms", "50 ms", "0.1 s"]
+    assert [words for _, words in axis.below] == ["0.5 FFT pairs", "1", "2.5", "5"]
+
+
 def test_plots_stand_one_below_the_other():
     marks = (Mark(0.1, 1.0, tooltip="a"), Mark(0.2, 2.0, tooltip="b"))
     x, y = time_axis([m.x for m in marks], "time"), value_axis([m.y for m in marks], "worth")
