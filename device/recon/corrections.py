@@ -26,6 +26,7 @@ from device.recon.stage import Step
 from device.values import Calibration, Image, Mask, Reconstruction, Report
 
 SPOT_SEARCHES = 4
+MIN_SPOTTED = 0.9  # rms residual of a frame with spots: noise alone leaves 0.85 to 1.01, faint spots 0.97 to 1.03
 GHOST_SEARCHES = 4
 GHOST_BETTER = 0.997  # of the residual: a ghost of 10 % 0.959 to 0.993, noise of columns 0.999
 MIN_SHARE, MAX_SHARE = 0.01, 0.8  # of the light of the first image
@@ -254,9 +255,9 @@ class Corrections:
         """Return the solution of the frame without its spots, if the forward model explains it.
 
         The first residual shows the largest spots only, beside errors that they cause around them: each search is one
-        of the frame without the spots found before.
+        of the frame without the spots found before, also where the rest is too little to show in the rms residual.
         """
-        first = spots = _spots(whole.run)
+        first = spots = _spots(whole.run, MIN_SPOTTED)
         if first is None:
             return whole
         run, grid = whole.run, whole.run.done.grid  # a later solution may end after its quick look, on another grid
@@ -347,8 +348,12 @@ def _trace(run: FrameRun, ghost: Ghost | None) -> float:
     return 0.0 if trace is None or ghost is None else trace.strength_at(ghost.shift)
 
 
-def _spots(run: FrameRun) -> Spots | None:
-    return None if run.diagnostics is None else run.diagnostics.spots
+def _spots(run: FrameRun, least: float = 0.0) -> Spots | None:
+    """Return the spots of a solved frame; None without any, or with a residual of at most `least`."""
+    known = run.diagnostics
+    if known is None or known.find_spots is None or known.residual is None or known.residual <= least:
+        return None
+    return known.find_spots()
 
 
 def _falls(before: Solution, after: Solution, to: float = 1.0, most: float = float("inf")) -> bool:

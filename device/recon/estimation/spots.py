@@ -15,6 +15,7 @@ from device.values import Image, Mask
 NEAR_SAMPLES = 3  # side of the square over which the residual is averaged
 OUTLYING_SD = 6.0  # robust standard deviations of such a mean; clean frames have no 12 connected samples beyond
 MIN_SAMPLES = 12
+SCALE_STEP = 3  # samples, of which one is taken for the robust standard deviation
 BORDER_SAMPLES = 3  # left out around a spot: its edge
 
 
@@ -34,8 +35,13 @@ def find_spots(left_sd: Image, good: Mask) -> Spots | None:
     `good` is False for missing samples.
     """
     near = ndimage.uniform_filter(np.where(good, left_sd, np.float32(0)), NEAR_SAMPLES)
-    scale = float(np.median(np.abs(near[good]))) / 0.6745 if good.any() else 0.0
-    areas, count = ndimage.label((np.abs(near) > OUTLYING_SD * scale) & good)
+    size = np.abs(near)
+    some = (slice(None, None, SCALE_STEP),) * 2
+    scale = float(np.median(size[some][good[some]])) / 0.6745 if good[some].any() else 0.0
+    outlying = (size > OUTLYING_SD * scale) & good
+    if np.count_nonzero(outlying) < MIN_SAMPLES:
+        return None
+    areas, count = ndimage.label(outlying)
     numbers = np.arange(1, count + 1)
     sizes = ndimage.sum_labels(good, areas, numbers)
     large = np.isin(areas, numbers[sizes >= MIN_SAMPLES])

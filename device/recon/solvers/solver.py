@@ -31,8 +31,8 @@ class Diagnostics:
         Parameters, most of them chosen from the frame.
     quality
         Figures of frame and picture.
-    spots
-        Parts of the frame that no object explains; None: none, or not searched for.
+    find_spots
+        Search for parts of the frame that no object explains, also after the next frame; None: it cannot be searched.
     unevenness
         Smooth part of the residual in units of its noise; None if it is unknown.
     find_uneven
@@ -48,7 +48,7 @@ class Diagnostics:
     residual: float | None = None
     regularisation: Figures = field(default_factory=dict)
     quality: Figures = field(default_factory=dict)
-    spots: Spots | None = None
+    find_spots: Callable[[], Spots | None] | None = None
     unevenness: float | None = None
     find_uneven: Callable[[], Sequence[UnevenLight]] | None = None
     ghost_trace: GhostTrace | None = None

@@ -36,7 +36,6 @@ KAPPA = 1.8  # of tau: within 0.03 dB of the optimum over 1 to 120 ke-, bins 2 a
 RHO = 5.0  # stiffness of z and w, in units of tau per level
 STIFF = 1.0  # stiffness of v, in units of a typical weight
 TAPER_PX = 60
-MAX_NOISE = 1.05  # rms residual of noise alone: 0.85 to 1.01
 FILLS = 2  # of a frame with gaps; see `_fill_gaps`
 
 
@@ -129,7 +128,7 @@ class EvidenceWiener:
         self.diagnostics = replace(
             known,
             residual=known.residual if added.residual is None else added.residual,
-            spots=known.spots if added.spots is None else added.spots,
+            find_spots=added.find_spots or known.find_spots,
             unevenness=known.unevenness if added.unevenness is None else added.unevenness,
             find_uneven=added.find_uneven or known.find_uneven,
             ghost_trace=known.ghost_trace if added.ghost_trace is None else added.ghost_trace,
@@ -320,8 +319,7 @@ class TotalVariation(EvidenceWiener):
         """Write the picture to `out` (grid, float32), and its misfit to `diagnostics`.
 
         `residual` is the rms residual in units of the noise. With a known field the quality figures also
-        have `coverage` and the flicker figure `banding`, and if more than noise is left, `spots` are searched for, and
-        uneven light can be.
+        have `coverage` and the flicker figure `banding`, and spots and uneven light can be searched for.
         """
         super().finish(out)
         noise = self.detail.noise
@@ -344,8 +342,5 @@ class TotalVariation(EvidenceWiener):
                 self._add_diagnostics(
                     Diagnostics(find_uneven=partial(find_uneven_light, frame, self.shading.blurred))
                 )  # the picture does not wait for the search
-            if residual > MAX_NOISE:
-                variance_dn2 = noise.per_dn * np.maximum(seen, 0) + noise.floor_dn2
-                left /= np.sqrt(np.maximum(variance_dn2, 1e-9))
-                spots = find_spots(left, self._good > 0)
-                self._add_diagnostics(Diagnostics(spots=spots))
+            left /= np.sqrt(np.maximum(noise.per_dn * np.maximum(seen, 0) + noise.floor_dn2, 1e-9))
+            self._add_diagnostics(Diagnostics(find_spots=partial(find_spots, left, self._good > 0)))
