@@ -23,6 +23,7 @@ MIN_UNEVENNESS = 3.0  # clean frames up to 2.7, vignetting of 20 % at 500 electr
 FALLS = 0.5  # of the unevenness: what a correction has to reach
 GAIN_DEGREE = 2  # of the polynomial: higher ones follow the retina's own shading
 GAIN_STEPS = 4  # Gauss-Newton steps
+PLANE = 1  # degree of the polynomial of light that rises over the sensor
 MIN_FALLOFF = 0.05  # clean frames up to 0.03
 MAX_FALLOFF = 0.7  # with more a part of the frame is dark, or its counts are not linear
 LEAK_RIDGE = 1e-5
@@ -35,8 +36,8 @@ FALLOFF = (
     "Measure the flat frame again."
 )
 LEAK = (
-    "Light that is no image, {share:.1%} of the frame, falls on the sensor near its {corner} corner; it was taken out. "
-    "Look for a leak of light there."
+    "Light that is no image, {share:.1%} of the frame, falls on the sensor, most near its {corner} corner; it was "
+    "taken out. Look for a leak of light there."
 )
 Floats = NDArray[np.float64]
 
@@ -117,13 +118,16 @@ def _leak(frame: Linear, blurred: BlurredModes) -> tuple[float, UnevenLight | No
     share, means = block_means(frame, blurred.n)
     seen = _with_constant(blurred)
     brightest = np.float32(seen[0].max())
+    plane = SensorPolynomial(blurred.shape, blurred.n, PLANE)
     corners = _corners(blurred.shape, blurred.shape[1])
-    functions = np.concatenate([seen, brightest * corners.reshape(len(corners), -1)])
+    functions = np.concatenate([seen, brightest * corners.reshape(len(corners), -1), brightest * plane.on_blocks[1:]])
     ridges = np.full(len(functions), LEAK_RIDGE)
     ridges[: len(seen)], ridges[len(seen) - 1] = RIDGE, STRAY_RIDGE
     coefficients, left = _fitted(functions, means, blurred.weights * share, ridges)
-    amplitudes = (coefficients[len(seen) :] * brightest).astype(np.float32)
-    added_dn = np.tensordot(amplitudes, _corners(frame.y.shape, frame.y.shape[1]), 1)
+    of_corners, of_plane = np.split((coefficients[len(seen) :] * brightest).astype(np.float32), [len(corners)])
+    added_dn = np.tensordot(of_corners, _corners(frame.y.shape, frame.y.shape[1]), 1)
+    added_dn += plane.on_samples(np.concatenate([[0], of_plane]), frame.y.shape)
+    added_dn -= added_dn.min()  # the solver has a constant of its own
     added_dn = np.asarray(added_dn, np.float32)
     leak = float(added_dn.mean() / frame.mean_dn) if frame.mean_dn > 0 else 0.0
     if leak < MIN_LEAK:
