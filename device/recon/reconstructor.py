@@ -575,7 +575,8 @@ def _checked_match(owner: Reconstructor, run: FrameRun, quality: dict[str, float
 def _or_far(match: Match, refraction: Refraction | NoRefraction | None, explained: bool) -> Match:
     """Return FOREIGN_OR_FAR for a frame that is not explained, and best at the end of the search for the refraction."""
     is_far = isinstance(refraction, NoRefraction) and refraction.is_far
-    return Match.FOREIGN_OR_FAR if is_far and not explained and match in (Match.UNKNOWN, Match.FOREIGN) else match
+    is_open = match in (Match.UNKNOWN, Match.FOREIGN, Match.CONSISTENT)  # with a part of the PSF's structure
+    return Match.FOREIGN_OR_FAR if is_far and not explained and is_open else match
 
 
 def _refracted(stages: list[Stage]) -> list[Stage]:
