@@ -30,6 +30,7 @@ MIN_SPOTTED = 0.9  # rms residual of a frame with spots: noise alone leaves 0.85
 GHOST_SEARCHES = 4
 GHOST_BETTER = 0.997  # of the residual: a ghost of 10 % 0.959 to 0.993, noise of columns 0.999
 MIN_SHARE, MAX_SHARE = 0.01, 0.8  # of the light of the first image
+MIN_GHOST = 0.035  # of it: in stray light of 20 % one of 0.025 was found that is none; less costs no picture
 GHOST_FALLS = 0.25  # of the trace of a ghost: less is left of one that is taken out
 MAX_HIDDEN = 0.15  # share of the sensor: with more the frame is another one
 BETTER = 0.9  # of the residual of the whole frame: by chance up to 0.97, dust at 500 electrons 0.78
@@ -214,7 +215,8 @@ class Corrections:
             tried.append(again)
             left = _trace(again.run, ghost)
             if abs(left) < GHOST_FALLS * whole_trace:
-                if not _falls(whole, again, GHOST_BETTER) or states_misfit(again.made.report.warnings):
+                is_better = light.share >= MIN_GHOST and _falls(whole, again, GHOST_BETTER)
+                if not is_better or states_misfit(again.made.report.warnings):
                     break
                 return whole.choice(again, tried).with_correction(light.key, light.share, light.words)
             if left >= before[1]:  # it is no ghost
