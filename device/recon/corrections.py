@@ -1,4 +1,4 @@
-"""Corrections of a frame that the forward model does not explain: flicker, uneven light, dust and reflexes, a pupil.
+"""Corrections of a frame that the forward model does not explain: flicker, uneven light, ghost, spots, a pupil.
 
 Each one changes the frame, or the PSF, solves it again, and is kept only if the forward model then explains the frame
 better. None begins that would end after the deadline.
@@ -26,7 +26,7 @@ from device.recon.stage import Step
 from device.values import Calibration, Image, Mask, Reconstruction, Report
 
 SPOT_SEARCHES = 4
-MIN_SPOTTED = 0.9  # rms residual of a frame with spots: noise alone leaves 0.85 to 1.01, faint spots 0.97 to 1.03
+MIN_SPOTTED = 0.9  # rms residual beyond which spots are searched for: noise has 0.85 to 1.01, faint spots to 1.03
 GHOST_SEARCHES = 4
 GHOST_BETTER = 0.997  # of the residual: a ghost of 10 % 0.959 to 0.993, noise of columns 0.999
 MIN_SHARE, MAX_SHARE = 0.01, 0.8  # of the light of the first image
@@ -195,7 +195,7 @@ class Corrections:
         return whole.choice(again, [again]).with_correction("flicker", steady.flicker)
 
     def _without_ghost(self, whole: Solution) -> Generator[Step, None, Solution]:
-        """Return the solution of the frame without a displaced second image, if its trace in the residual vanishes.
+        """Return the solution of the frame without a displaced second image, if its trace falls to a quarter.
 
         The trace is in proportion to what is left of the ghost: the share is found by the secant method.
         """
@@ -232,10 +232,13 @@ class Corrections:
         return light.without(run.counts, offset, self._white_dn, run.done.grid)
 
     def _in_even_light(self, whole: Solution) -> Generator[Step, None, Solution]:
-        """Return the solution of the frame as in even light, if its residual falls much."""
+        """Return the solution of the frame as in even light, if its unevenness halves."""
         run, before = whole.run, _unevenness(whole.run)
         find = None if run.diagnostics is None else run.diagnostics.find_uneven
-        if before is None or find is None or not run.fits(self._search_cost.seconds + whole.duration_s):
+        if before is None or find is None:
+            return whole
+        if not run.fits(self._search_cost.seconds + whole.duration_s):
+            self._search_cost.skipped(usually_fits=False)  # forgets a stall
             return whole
         begin_s, tried = run.clock.now_s(), []
         lights = find()

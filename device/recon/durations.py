@@ -6,9 +6,9 @@ from statistics import median, median_low
 
 WINDOW = 200  # durations: the next one is longer than the second largest in one of a hundred runs
 QUANTILE = 0.99
-STALL = 8.0  # times the median: the machine was occupied during one step; beside a steady load at most 5
-FORGET = 0.997  # of a step that is skipped: half of its estimate after 231 skips, and whole again after one run
-LEAST_RUNS = 3  # of which the median leaves out a stall
+STALL = 8.0  # times the median: the machine was busy during one step; a steady load makes at most 5
+FORGET = 0.997  # a skip, of the quantile: half after 231, not below the median; whole again after one run
+LEAST_RUNS = 3  # fewest whose median shows no stall
 PACE_WINDOW = 11
 LEAST_S = 1e-6
 CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one

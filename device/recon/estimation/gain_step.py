@@ -22,7 +22,7 @@ MIN_LIT = 0.5  # of the bands
 MIN_SHARE = 0.008  # of the light: a step of 0.01 costs PCC up to 0.004; clean frames have up to 0.007
 MAX_SHARE = 0.3  # more is that of dead columns
 MIN_SURE = 7.0  # standard errors of the median over the bands
-MIN_RATIO = 2.2  # to the largest step within NEAR spans: clean frames that are sure have up to 1.9, 0.01 has 3.2
+MIN_RATIO = 2.2  # to the largest step within NEAR spans: clean frames past MIN_SURE have up to 1.9, 0.01 has 3.2
 NEAR = 20
 WORDS = (
     "The gain of the sensor changes by {share:.1%} at column {column}, which the flat frame does not show; it was "
@@ -80,7 +80,7 @@ def find_gain_step(bands: Image) -> GainStep | None:
 
 
 def _median(values: Series, lit: NDArray[np.bool_]) -> Series:
-    """Return the median over the lit bands at each place, (places,); numpy's without NaN takes five times as long."""
+    """Return the median over the lit bands at each place, (places,); `np.nanmedian` takes five times as long."""
     rising = np.sort(np.where(lit, values, np.inf), axis=0)
     last = lit.sum(axis=0)[None] - 1
     middle = [np.take_along_axis(rising, index, axis=0)[0] for index in (last // 2, (last + 1) // 2)]

@@ -20,12 +20,12 @@ from device.values import Image
 REGULARISATION = np.float32(1e-3)  # of the deconvolved residual
 EDGE_SAMPLES = 0.75  # beyond the field's edge that are left out
 REACH = 1.6  # radii of the field, within which light of the ghost is searched for
-NEAR = 5.0  # samples between the displacement found in means and that found in all samples
-MAX_AWAY = 0.6  # radii of the field
-MIN_OVERLAP = 1e-3  # of the largest light that a displacement brings out of the field
+NEAR = 5.0  # samples, at most, from the displacement found in means to that found in all samples
+MAX_AWAY = 0.6  # field radii, of the displacement
+MIN_OVERLAP = 1e-3  # of the largest denominator of `strength`: added to each of them
 STRENGTH = 11.5  # a / (1 + a)^2 of a ghost over its strength in bright frames: 10 to 16; at 500 electrons 5 to 8
 MAX_SEEN = 0.2  # of a share of 0.38
-MIN_SCORE = 10.0  # clean frames have up to 4.6, ghosts of 5 % 16 to 23
+MIN_SCORE = 10.0  # clean frames have up to 4.6, ghosts of 5 % 16 to 23; the least share is corrections.MIN_GHOST
 WORDS = (
     "A second image with {share:.0%} of the light, displaced by {right:+.0f} pixels to the right and {down:+.0f} down, "
     "was taken out. Look at the beam splitter: if it was turned or exchanged, measure the PSF again."
@@ -78,7 +78,7 @@ class GhostTrace(NamedTuple):
 def share_of(strength: float) -> float:
     """Return the share of a ghost in the light of the first image, about, from the strength of its trace.
 
-    A share a that is not taken out has the strength of a / (1 + a)^2.
+    The strength of a share a is a / (1 + a)^2 / STRENGTH.
     """
     seen = min(STRENGTH * strength, MAX_SEEN)
     return float((1 - 2 * seen - (1 - 4 * seen) ** 0.5) / (2 * seen))

@@ -1,7 +1,7 @@
 """Order of the rows of a frame: rows that repeat others, and places where rows are missing; NUMERICS.md 6.4.
 
 A camera or a driver that loses packets repeats rows or moves the rest up. No object explains such a frame, and no
-weight helps: rows at the wrong place are refused. Noise of neighbouring rows is independent; the PSF makes their light
+weight helps: it is refused. Noise of neighbouring rows is independent; the PSF makes their light
 alike.
 """
 
@@ -15,7 +15,7 @@ from device.values import Image, Mask
 
 Series = NDArray[np.float64]
 
-MIN_LIKENESS = 0.6  # of the fine texture of two rows, over that of most: independent noise has up to 0.25
+MIN_LIKENESS = 0.6  # of the fine texture of two rows, minus the median: independent noise has up to 0.25
 MAX_TEXTURE = 0.3  # likeness of most rows: with more the frame is no raw one (scaled, or smooth)
 MIN_REPEATED = 0.004  # of the rows
 MAX_REPEATED = 0.3  # of the rows: more are those of a scaled file
@@ -25,9 +25,9 @@ SEEN = (
     5  # of them must show a jump: 3 to 19 dust spots in a row looked like one in 16 of 180 frames with 3, in 1 with 4
 )
 MIN_ROWS = 256  # of a sensor: in few and short rows texture is alike by chance, and a PSF as steep as a jump
-SPANS = 135  # in the height of a frame: rows above and below, whose means are compared
-# Their difference over the largest one near by, of the counts and of the shares of a segment's light. Clean frames have
-# up to 1.1 and 0.9, dust 1.5 and 1.35; bright frames without 2.2 % of their rows 2.2 and 2.0 (median).
+SPANS = 135  # in the height of a frame: the rows of each of the two compared means
+# Variance of their difference over the largest near by, of the counts and of the shares of a segment's light. Clean
+# frames have up to 1.1 and 0.9, dust 1.5 and 1.35; bright frames without 2.2 % of their rows 2.2 and 2.0 (median).
 MIN_JUMPS = (1.6, 1.42)
 FAINT = 1e-9
 MIN_LIGHT = 0.2  # of the brightest row
@@ -96,10 +96,10 @@ def _span(rows: int) -> int:
 
 
 def _jumps(bins: Image, even: float, of_shares: bool = False) -> Series:
-    """Return how much more the means of the rows above and below each place differ than near it, (places,).
+    """Return the variance ratio of a step at each place to the largest 1 to 3 spans away, (places,).
 
-    As they are, or in shares of the light of each row's segment, in which a gain of some rows is no jump; the SEEN-th
-    largest of the segments. A place is a row with `_span` rows above it, from the first such row on. 0 where rows are
+    The SEEN-th largest of the segments; with `of_shares` in shares of the light of each row's segment, in which a gain
+    of some rows is no jump. A place is a row with `_span` rows above it, from the first such row on. 0 where rows are
     not lit, or where one of those that are compared has less than `even` of the light of the brightest.
     """
     span = _span(len(bins))
@@ -123,7 +123,7 @@ def _jumps(bins: Image, even: float, of_shares: bool = False) -> Series:
 
 
 def _steps(rows: Image, span: int) -> Image:
-    """Return the variance of the difference between the means of `span` rows above and below each place.
+    """Return the variance over bins of the step between the means of `span` rows above and below each place.
 
     `rows`: (rows, segments, bins); the result is (segments, places).
     """

@@ -1,6 +1,6 @@
 """Spots: parts of a frame that no object explains, such as dust on the sensor and reflexes; NUMERICS.md 3.10.
 
-Dust shades pixels behind the diffuser and a reflex lights them, with an edge that is sharper than the PSF. No object
+Dust on the sensor shades pixels and a reflex lights them, with an edge that is sharper than the PSF. No object
 explains that, so it stays in the residual of the picture, in connected samples.
 """
 
@@ -13,14 +13,14 @@ from device.recon.model.grid import Grid
 from device.values import Image, Mask
 
 NEAR_SAMPLES = 3  # side of the square over which the residual is averaged
-OUTLYING_SD = 6.0  # robust standard deviations of such a mean; clean frames have no 12 connected samples beyond
-MIN_SAMPLES = 12
-SCALE_STEP = 3  # samples, of which one is taken for the robust standard deviation
+OUTLYING_SD = 6.0  # robust standard deviations of such a mean; clean frames have no MIN_SAMPLES connected beyond
+MIN_SAMPLES = 12  # connected, of a spot
+SCALE_STEP = 3  # every third row and column gives the robust standard deviation
 BORDER_SAMPLES = 3  # left out around a spot: its edge
 
 
 class Spots(NamedTuple):
-    """Samples of the window that are left out, (rows, cols); whether most light is missing there, as behind dust; and
+    """Samples of the window that are left out, (rows, cols); whether they lose light in all, as behind dust; and
     the middle of the largest spot, (row, col) in samples.
     """
 

@@ -20,7 +20,7 @@ from device.values import Image
 
 SQUARE = 32  # side in samples of the squares whose means show uneven light
 MIN_UNEVENNESS = 3.0  # clean frames up to 2.7, vignetting of 20 % at 500 electrons 3.2
-FALLS = 0.5  # of the unevenness: what a correction has to reach
+FALLS = 0.5  # of the first unevenness: a correction leaves less
 GAIN_DEGREE = 2  # of the polynomial: higher ones follow the retina's own shading
 GAIN_STEPS = 4  # Gauss-Newton steps
 PLANE = 1  # degree of the polynomial of light that rises over the sensor
@@ -28,15 +28,15 @@ MIN_FALLOFF = 0.05  # clean frames up to 0.03
 MAX_FALLOFF = 0.7  # with more a part of the frame is dark, or its counts are not linear
 LEAK_RIDGE = 1e-5
 MIN_LEAK = 0.002  # of the mean light: less changes no picture
-REACHES = (0.04, 0.08, 0.16, 0.32)  # of the sensor's width: exponential falloff from a corner
-SIGMAS = (0.05, 0.1, 0.2)  # the same of Gaussian falloff
+REACHES = (0.04, 0.08, 0.16, 0.32)  # of the sensor's width: exponential leak from a corner
+SIGMAS = (0.05, 0.1, 0.2)  # the same of a Gaussian one
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 FALLOFF = (
     "The light falls off by {share:.0%} over the sensor, which the flat frame does not show; it was evened out. "
     "Measure the flat frame again."
 )
 LEAK = (
-    "Light that is no image, {share:.1%} of the frame, falls on the sensor, most near its {corner} corner; it was "
+    "Light that is no image, {share:.1%} of the light, falls on the sensor, most near its {corner} corner; it was "
     "taken out. Look for a leak of light there."
 )
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ class UnevenLight(NamedTuple):
 
 
 def unevenness(left_dn: Image, seen_dn: Image, noise: Noise) -> float:
-    """Return the rms of the means of a residual (rows, cols) over squares of SQUARE samples, in units of their noise.
+    """Return the rms of the means of a residual (rows, cols) over SQUARE x SQUARE samples, in units of their noise.
 
     `seen_dn` is the light there. Below 1 for noise; 0 for a window that is smaller than a square.
     """
@@ -90,7 +90,7 @@ def find_uneven_light(frame: Linear, blurred: BlurredModes) -> list[UnevenLight]
 def _falloff(frame: Linear, blurred: BlurredModes) -> tuple[float, UnevenLight | None]:
     """Return what the fit with a gain leaves, and the gain: the exponential of a polynomial, which has no constant.
 
-    None for one that changes no picture. Gauss-Newton steps in the coefficients of shading and logarithm of the gain.
+    None for too small or large a fall. Gauss-Newton steps in the coefficients of shading and logarithm of the gain.
     """
     share, means = block_means(frame, blurred.n)
     polynomial = SensorPolynomial(blurred.shape, blurred.n, GAIN_DEGREE)
