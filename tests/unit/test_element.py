@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from device.config.element import half_widths_um
-from device.config.head_file import load_head
+from device.config.head_file import OpticsSpec, load_head
 from device.errors import SpecError
+from device.optics.lens_design import focal_um
 from device.optics.lens_layout import centroidal, hexagonal, layout_csv
 from services import resources
 from tests.paper.bench import with_changes
@@ -60,10 +61,12 @@ def test_cells_share_the_iris_by_the_nearest_lens() -> None:
 
 
 def test_shipped_layouts_are_those_that_the_program_computes() -> None:
+    """They focus 6 dioptres behind the sensor, which balances their curved field with a PSF measured on the axis."""
+    behind_um = focal_um(OpticsSpec(), 6.0)
     layouts = {
-        "lenslets_22.csv": centroidal(22, 3200.0, 6000.0, seed=0),
-        "lenslets_hexagonal.csv": hexagonal(1000.0, 3200.0, 6000.0),
-        "one_lens.csv": centroidal(1, 1200.0, 6000.0, seed=0),
+        "lenslets_22.csv": centroidal(22, 3200.0, behind_um, seed=0),
+        "lenslets_hexagonal.csv": hexagonal(1000.0, 3200.0, behind_um),
+        "one_lens.csv": centroidal(1, 1200.0, behind_um, seed=0),
     }
     for name, lenses in layouts.items():
         assert (resources.HEADS / name).read_text() == layout_csv(lenses)

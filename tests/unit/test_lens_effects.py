@@ -24,7 +24,7 @@ def test_behind_lenslets_nothing_that_is_present_is_skipped() -> None:
     assert 0 < planned["refraction"].eta < 0.05
     assert "a diffuser's" in planned["refraction"].why
     assert all(decision.simulated == (decision.eta > 0) for decision in planned.values())
-    assert "12 and 27 dpt too strong" in planned["lens_curvature"].why
+    assert "12 and 26 dpt too strong" in planned["lens_curvature"].why
     setup = world(coarse(head, 4)).setup("green")
     assert setup.lenses == (ElementFlaws(focal_spread=0.02, moved_um=1.0), True)
     plain = {decision.name: decision for decision in decide(scene(load_head(SCENES / "healthy.toml")))}
