@@ -5,6 +5,7 @@ from math import hypot
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from device.config.element import ElementSpec, Lenses
 from device.config.head_file import OpticsSpec
@@ -25,19 +26,30 @@ def optics(lenses: Lenses, iris_um: float, **element: object) -> OpticsSpec:
     return OpticsSpec(iris_um=iris_um, element=ElementSpec(kind="lenslets", lenses=lenses, **element))
 
 
-def fresnel_sum(lenses: Lenses, iris_um: float, pitch_um: float, size: int, eye: Refraction) -> Plane:
-    """Return the coherent light of the whole iris by the Fresnel integral as a sum over its places; no code shared."""
+def fresnel_sum(
+    lenses: Lenses,
+    iris_um: float,
+    pitch_um: float,
+    size: int,
+    eye: Refraction,
+    aperture_um: float = np.inf,
+    wavelength_um: float = 0.55,
+) -> Plane:
+    """Return the coherent light of the whole iris by the Fresnel integral as a sum over its places; no code shared.
+
+    Round lenses have clear gaps.
+    """
     places = (np.arange(round(iris_um / 1.25)) + 0.5) * 1.25 - iris_um / 2
     right, down = np.meshgrid(places, places)
     squares = np.array([(right - x) ** 2 + (down - y) ** 2 for x, y, _ in lenses])
     focal = np.array([f for *_, f in lenses])[squares.argmin(axis=0)]
-    path = -squares.min(axis=0) / (2 * focal)
+    path = np.where(squares.min(axis=0) < aperture_um**2 / 4, -squares.min(axis=0) / (2 * focal), 0)
     wavefront = eye.m_dpt * (right**2 + down**2) + eye.j0_dpt * (right**2 - down**2) + 2 * eye.j45_dpt * right * down
     path -= ANGULAR**2 * 1e-6 * wavefront / 2
-    light = ((np.hypot(right, down) <= iris_um / 2) * np.exp(2j * np.pi * path / 0.55)).astype(np.complex64)
+    light = ((np.hypot(right, down) <= iris_um / 2) * np.exp(2j * np.pi * path / wavelength_um)).astype(np.complex64)
     parts = 5
     at = (np.arange(size * parts) - (size // 2) * parts - (parts - 1) / 2) * pitch_um / parts
-    kernel = np.exp(1j * np.pi * (at[:, None] - places[None, :]) ** 2 / (0.55 * Z_UM)).astype(np.complex64)
+    kernel = np.exp(1j * np.pi * (at[:, None] - places[None, :]) ** 2 / (wavelength_um * Z_UM)).astype(np.complex64)
     intensity = np.abs(kernel @ light @ kernel.T).astype(np.float64) ** 2
     pixels = intensity.reshape(size, parts, size, parts).sum(axis=(1, 3))
     return np.asarray(pixels / pixels.sum())
@@ -50,6 +62,19 @@ def test_psf_is_the_fresnel_integral_of_the_whole_iris(eye: Refraction) -> None:
     expected = fresnel_sum(THREE, 1200.0, 3.45, len(psf), eye)
     assert np.corrcoef(psf.ravel(), expected.ravel())[0, 1] > 0.99995
     assert np.linalg.norm(psf - expected) < 0.01 * np.linalg.norm(expected)
+
+
+def test_clear_gaps_spread_their_light_as_the_whole_iris_does_in_the_light_of_an_led() -> None:
+    """The light of a gap and that of its lens interfere in one wavelength, and hardly in the bandwidth."""
+    psf = spots(optics(THREE, 1200.0, aperture_um=400.0, gaps="clear"), 3.45, 1, lines=1)
+    in_led = [fresnel_sum(THREE, 1200.0, 3.45, len(psf), Refraction(), 400.0, um) for um in (0.53, 0.543, 0.557, 0.57)]
+    expected = np.mean(in_led, axis=0)
+    assert np.corrcoef(psf.ravel(), expected.ravel())[0, 1] > 0.9995
+    rows, cols = (np.indices(psf.shape) - len(psf) // 2) * 3.45
+    beside = np.min([np.hypot(cols - right, rows - down) for right, down, _ in THREE], axis=0) > 40
+    gaps, sums = (ndimage.gaussian_filter(np.where(beside, plane, 0), 5)[beside] for plane in (psf, expected))
+    assert gaps.sum() == pytest.approx(sums.sum(), rel=0.03)
+    assert np.corrcoef(gaps, sums)[0, 1] > 0.97
 
 
 @pytest.mark.parametrize("pitch_um", [3.45, 6.9, 10.08])
