@@ -249,7 +249,10 @@ class OpticsSpec(Table):
 
     def geometry(self, pitch_um: float) -> Geometry:
         """Return the scale between degrees at the eye and pixels of a sensor with that pixel pitch."""
-        return Geometry(pitch_um, self.diffuser_to_sensor_um, self.angular_magnification)
+        powers = [1 / self.diffuser_to_sensor_um - 1 / focal_um for *_, focal_um in self.element.lenses]
+        focus_dpt = 1e6 * sum(powers) / len(powers) / self.angular_magnification**2 if powers else None
+        scales = pitch_um, self.diffuser_to_sensor_um, self.angular_magnification
+        return Geometry(*scales, lens_focus_dpt=focus_dpt, lens_index=self.element.index if powers else None)
 
 
 class ReplaySpec(Table):

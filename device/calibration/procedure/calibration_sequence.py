@@ -26,6 +26,7 @@ from device.calibration.procedure.dioptres import (
 )
 from device.calibration.procedure.finished_steps import Step, StepCheckpoints
 from device.calibration.procedure.flats import MIN_SHARE, Flats, measure_flats
+from device.calibration.procedure.lens_check import lens_figures, lens_messages
 from device.calibration.procedure.moments import Moments
 from device.calibration.procedure.point_source import MotionCheck, PointSource, measure_point_source, refuse_level
 from device.calibration.procedure.raw_recorder import RawRecorder
@@ -33,9 +34,10 @@ from device.calibration.procedure.refraction_zero import ZeroCheck, compare_zero
 from device.calibration.procedure.step_exposures import SHORTEST_S, StepExposures
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
-from device.errors import CalibrationRefused
+from device.errors import CalibrationError, CalibrationRefused
 from device.optics.lit_angle import picture_field_deg
 from device.ports import Camera, Thermometer
+from device.recon.model.spots import find_spots
 from device.values import Calibration, Colour, Frame, Geometry, Psf, Sensor
 
 CalibrationTarget = Literal[
@@ -168,6 +170,7 @@ class CalibrationSequence:
             | _dioptre_figures(dioptres)
             | ({} if zero is None else zero.figures)
             | colours
+            | self._lens_figures(archive, calibration)
         )
         id = archive.add_and_activate(calibration, self._build_provenance(figures))
         if self.raw_recorder is not None:
@@ -263,6 +266,22 @@ class CalibrationSequence:
             return found
         self.operator.show_message(f"{message}, by {law.steps} dark steps")
         return found | law.figures
+
+    def _lens_figures(self, archive: Archive, calibration: Calibration) -> dict[str, float]:
+        """Return the figures of lenslets, and show what is wrong with them; none behind a diffuser."""
+        optics = self.job.spec.optics
+        spots = None if calibration.geometry is None else find_spots(calibration.psfs[0], calibration.geometry)
+        if optics is None or spots is None:
+            return {}
+        try:
+            before = archive.load()
+            earlier = before.calibration if before.provenance.serial == self.job.serial else None
+        except CalibrationError:  # none yet, or one that cannot be read
+            earlier = None
+        figures = lens_figures(spots, optics.element.lenses, earlier)
+        for message in lens_messages(figures):
+            self.operator.show_message(message)
+        return figures
 
     def _colour_psfs(self, darks: Darks, flats: Flats, point: PointSource) -> tuple[tuple[Psf, ...], dict[str, float]]:
         """Return the PSF, one more per colour that differs, and each colour's correlation and scale to the first."""
