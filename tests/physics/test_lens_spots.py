@@ -1,7 +1,7 @@
 """Parametric PSF of lenslets against the simulator's wave optics, and what calibration finds wrong with them."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from math import radians, tan
 
 import numpy as np
@@ -15,8 +15,10 @@ from device.optics import lenslets
 from device.optics.diffuser import Refraction
 from device.recon.estimation.psf_warp import transform, warped
 from device.recon.model.spots import GAP_LIGHT, Spots, find_spots, without_noise
+from device.sim.plan import decide
 from device.values import Calibration, Geometry, Image, Psf, Sensor
 from services import resources
+from tests.paper.bench import Bench
 from tests.scenes import speckle
 
 HEAD = load_head(resources.HEADS / "imx296_lenslets.toml")
@@ -123,3 +125,11 @@ def without_spot(psf: Psf, lens: tuple[float, float, float]) -> Psf:
     near = np.hypot(cols - lens[0], rows - lens[1]) < 120
     pixels: Image = np.where(near, 0, psf.pixels)
     return Psf(pixels)
+
+
+def test_refraction_of_a_bright_frame_is_not_refused() -> None:
+    """Samples of 24 um, enough for a caustic, do not resolve the spots: the refinement explained no retina."""
+    bench = Bench(2)
+    flat = partial(decide, without=("lens_curvature",))
+    take = bench.expose("human_eye_imx296_power_lenslets", {"sim.eye.m_dpt": 2.0, "sim.eye.j0_dpt": 0.5}, flat)
+    assert bench.refraction(take) == pytest.approx((2.0, 0.5, 0.0), abs=0.1)
