@@ -37,6 +37,7 @@ class ElementSpec(Table):
     lenses: Lenses = ()
     aperture_um: float | None = Field(default=None, gt=0)
     gaps: Literal["black", "clear"] = "black"
+    flat_field: bool = False  # lenses of several surfaces: in focus over the whole field
     index: float = Field(default=1.5, gt=1, lt=2.5)
     abbe: float = Field(default=55.0, ge=15, le=100)
     thickness_um: float = Field(default=1000.0, gt=0, le=10000)

@@ -252,7 +252,11 @@ class OpticsSpec(Table):
         powers = [1 / self.diffuser_to_sensor_um - 1 / focal_um for *_, focal_um in self.element.lenses]
         focus_dpt = 1e6 * sum(powers) / len(powers) / self.angular_magnification**2 if powers else None
         scales = pitch_um, self.diffuser_to_sensor_um, self.angular_magnification
-        return Geometry(*scales, lens_focus_dpt=focus_dpt, lens_index=self.element.index if powers else None)
+        return Geometry(
+            *scales,
+            lens_focus_dpt=focus_dpt,
+            lens_index=None if not powers or self.element.flat_field else self.element.index,
+        )
 
 
 class ReplaySpec(Table):

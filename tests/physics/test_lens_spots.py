@@ -86,6 +86,13 @@ def test_psf_of_a_field_is_the_mean_of_its_places_behind_curved_lenses() -> None
     assert correlation(spots.of_eye(eye, 33.4), truth) > max(0.97, correlation(spots.of_eye(eye), truth) + 0.02)
 
 
+def test_excess_of_the_field_is_that_of_its_outermost_ring_and_zero_with_a_flat_field() -> None:
+    """OPTICS.md 2.9: 12.2 and 26.8 dpt at the edge for f = 6 mm; the last of three rings has 5/6 of it."""
+    excess_dpt = geometry().lens_excess_dpt(33.4)[-1]
+    assert excess_dpt == pytest.approx([(12.2 + 26.8) / 2 * 6000 / 6124 * 5 / 6, 0, 0], abs=0.1)
+    assert not optics(flat_field=True).geometry(PITCH_UM).lens_excess_dpt(33.4).any()
+
+
 def test_noise_between_the_spots_is_left_out_and_the_spots_stay() -> None:
     psf, clean = seen(noise=3e-3), seen()
     calibration = Calibration((psf,), Sensor(), geometry())

@@ -27,6 +27,9 @@ def test_behind_lenslets_nothing_that_is_present_is_skipped() -> None:
     assert "12 and 26 dpt too strong" in planned["lens_curvature"].why
     setup = world(coarse(head, 4)).setup("green")
     assert setup.lenses == (ElementFlaws(focal_spread=0.02, moved_um=1.0), True)
+    flat = with_changes(head, {"optics.element.flat_field": True})
+    assert {decision.name: decision for decision in decide(scene(flat))}["lens_curvature"].eta == 0
+    assert not world(coarse(flat, 4)).setup("green").lenses.curved
     plain = {decision.name: decision for decision in decide(scene(load_head(SCENES / "healthy.toml")))}
     assert all(plain[name].eta == 0 for name in ("lens_curvature", "lens_flaws", "lens_shift"))
 

@@ -19,6 +19,8 @@ class LensCurvature:
         """Return the size eta: 0 for a diffuser, else 1 (not measured)."""
         if scene.optics.element.kind != "lenslets":
             return _no_lenses()
+        if scene.optics.element.flat_field:
+            return Size(0.0, "the lenses have a flat field")
         sagittal, tangential = edge_dpt(scene)
         why = f"at the edge the lenses are {sagittal:.0f} and {tangential:.0f} dpt too strong; eta not measured"
         return Size(_PRESENT, why)
@@ -26,7 +28,7 @@ class LensCurvature:
     def apply(self, setup: OpticalSetup) -> None:
         """Compute the PSF of each place in the field with the lenses' power there."""
         if setup.optics.element.kind == "lenslets":
-            setup.lenses = setup.lenses._replace(curved=True)
+            setup.lenses = setup.lenses._replace(curved=not setup.optics.element.flat_field)
 
 
 def edge_dpt(scene: Scene) -> tuple[float, float]:
