@@ -70,8 +70,9 @@ def human_light(name: str) -> HumanLight:
 
 
 def shipped_heads() -> list[str]:
-    """Return the names of the head files with a lamp and a diffuser, without extension."""
-    heads = {path.stem: load_head(path) for path in files_in(resources.HEADS, "*.toml")}
+    """Return the names of the head files with a lamp and a diffuser, without extension, and without their copies."""
+    paths = files_in(resources.HEADS, "*.toml")
+    heads = {path.stem: load_head(path) for path in paths if not path.stem.startswith("sim_")}
     lit = {name: head.optics for name, head in heads.items() if head.light.backend != "none"}
     return [name for name, optics in lit.items() if optics is None or optics.element.kind == "diffuser"]
 

@@ -164,13 +164,16 @@ class CalibrationSequence:
         psfs, colours = self._colour_psfs(darks, flats, point)
         calibration = self._build_calibration(darks, flats, psfs, dioptres)
         calibration = replace(calibration, source_in_focus=in_focus and (zero is None or not zero.contradicts))
+        lenses = _lens_figures(self.job, archive, calibration)
+        for message in lens_messages(lenses):
+            self.operator.show_message(message)
         figures = (
             _measurement_figures(darks, flats, point)
             | self._dark_current_figures(archive, darks, flats)
             | _dioptre_figures(dioptres)
             | ({} if zero is None else zero.figures)
             | colours
-            | self._lens_figures(archive, calibration)
+            | lenses
         )
         id = archive.add_and_activate(calibration, self._build_provenance(figures))
         if self.raw_recorder is not None:
@@ -266,22 +269,6 @@ class CalibrationSequence:
             return found
         self.operator.show_message(f"{message}, by {law.steps} dark steps")
         return found | law.figures
-
-    def _lens_figures(self, archive: Archive, calibration: Calibration) -> dict[str, float]:
-        """Return the figures of lenslets, and show what is wrong with them; none behind a diffuser."""
-        optics = self.job.spec.optics
-        spots = None if calibration.geometry is None else find_spots(calibration.psfs[0], calibration.geometry)
-        if optics is None or spots is None:
-            return {}
-        try:
-            before = archive.load()
-            earlier = before.calibration if before.provenance.serial == self.job.serial else None
-        except CalibrationError:  # none yet, or one that cannot be read
-            earlier = None
-        figures = lens_figures(spots, optics.element.lenses, earlier)
-        for message in lens_messages(figures):
-            self.operator.show_message(message)
-        return figures
 
     def _colour_psfs(self, darks: Darks, flats: Flats, point: PointSource) -> tuple[tuple[Psf, ...], dict[str, float]]:
         """Return the PSF, one more per colour that differs, and each colour's correlation and scale to the first."""
@@ -389,6 +376,20 @@ def step_figures(step: Darks | Flats | PointSource) -> dict[str, float]:
         elif isinstance(value, np.ndarray) and value.dtype == bool:
             found[key] = float(value.sum())
     return found
+
+
+def _lens_figures(job: CalibrationJob, archive: Archive, calibration: Calibration) -> dict[str, float]:
+    """Return the figures of lenslets, beside the head's calibration before if there is one; none behind a diffuser."""
+    optics, geometry = job.spec.optics, calibration.geometry
+    spots = None if geometry is None else find_spots(calibration.psfs[0], geometry)
+    if optics is None or spots is None:
+        return {}
+    try:
+        before = archive.load()
+    except CalibrationError:  # none yet, or one that cannot be read
+        return lens_figures(spots, optics.element.lenses, None)
+    earlier = before.calibration if before.provenance.serial == job.serial else None
+    return lens_figures(spots, optics.element.lenses, earlier)
 
 
 def _measurement_figures(darks: Darks, flats: Flats, point: PointSource) -> dict[str, float]:

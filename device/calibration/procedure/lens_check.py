@@ -35,9 +35,9 @@ def lens_figures(spots: Spots, lenses: Lenses, earlier: Calibration | None) -> d
 
 def lens_messages(figures: dict[str, float]) -> Iterable[str]:
     """Yield a sentence for each figure of `lens_figures` that is beyond its limit."""
-    if missing := figures["lenses_without_spot"]:
+    if missing := figures.get("lenses_without_spot"):
         yield f"{missing:.0f} lenses have no spot of their own: they are covered, or merged with another lens"
-    if (beside := figures["lens_light_beside"]) > GAP_LIGHT:
+    if (beside := figures.get("lens_light_beside", 0.0)) > GAP_LIGHT:
         yield f"{beside:.0%} of the light passes beside the lenses: see whether there are clear gaps between them"
     if (moved_um := figures.get("lens_moved_um", 0.0)) > MAX_MOVED_UM:
         yield f"the centres of the lenses have moved by {moved_um:.1f} um since the calibration before"
