@@ -218,13 +218,13 @@ class CalibrationSequence:
             def measure(moved_mm: float = moved_mm) -> PointSource:
                 disc_px = self._disc_px() * eye_mm / (eye_mm + moved_mm)
                 there = self._measure_point(darks, flats, AXIAL_BRACKETS, disc_px)
-                seen[moved_mm] = similarity_of_points(point, there, pitch_um)
+                seen[moved_mm] = similarity_of_points(point, there, pitch_um, geometry)
                 refuse_wrong_position(seen[moved_mm], moved_mm, eye_mm, geometry)
                 return there
 
             there = self._checkpointed_step(stand.replace(" ", ""), PointSource, stand, measure)
             if moved_mm not in seen:  # loaded from its checkpoint
-                seen[moved_mm] = similarity_of_points(point, there, pitch_um)
+                seen[moved_mm] = similarity_of_points(point, there, pitch_um, geometry)
         try:
             found = fit_dioptre_scale({moved_mm: seen_point.scale for moved_mm, seen_point in seen.items()}, eye_mm)
         except CalibrationRefused:
@@ -275,15 +275,19 @@ class CalibrationSequence:
         job = self.job
         own = dict[Colour, Psf]()
         figures = dict[str, float]()
+
+        def similarity(there: PointSource) -> PsfSimilarity:
+            return similarity_of_points(point, there, job.spec.camera.pitch_um, job.geometry)
+
         for colour in job.other_colours:
 
             def measure(colour: Colour = colour) -> PointSource:
                 there = self._measure_point(darks, flats)
-                refuse_moved_source(colour, similarity_of_points(point, there, job.spec.camera.pitch_um), job.geometry)
+                refuse_moved_source(colour, similarity(there), job.geometry)
                 return there
 
             there = self._checkpointed_step(f"point-{colour}", PointSource, COLOUR_TARGETS[colour], measure)
-            found = similarity_of_points(point, there, job.spec.camera.pitch_um)
+            found = similarity(there)
             figures |= {f"psf_{colour}_likeness": found.correlation, f"psf_{colour}_scale": found.scale}
             kept = "kept as a PSF of its own" if needs_separate_psf(found) else "the same PSF"
             self.operator.show_message(

@@ -11,6 +11,7 @@ from device.values import Calibration
 
 ALIGNMENTS = 4  # of spots to lenses: shift and rotation, then the nearest lens again
 OWN_SPOT = 1 / 3  # of the distance to the nearest lens: a spot farther away is another lens's
+SAME_SPOT_UM = 30.0  # farther away is another lens, or a spot that a fault has displaced
 MAX_MOVED_UM = 1.0  # rms along an axis: 2 um cost 0.007 of the correlation of detail (OPTICS.md 2.9)
 
 Places = NDArray[np.float64]
@@ -36,7 +37,7 @@ def lens_figures(spots: Spots, lenses: Lenses, earlier: Calibration | None) -> d
 def lens_messages(figures: dict[str, float]) -> Iterable[str]:
     """Yield a sentence for each figure of `lens_figures` that is beyond its limit."""
     if missing := figures.get("lenses_without_spot"):
-        yield f"{missing:.0f} lenses have no spot of their own: they are covered, or merged with another lens"
+        yield f"lenses without a spot of their own: {missing:.0f}, covered or merged with another lens"
     if (beside := figures.get("lens_light_beside", 0.0)) > GAP_LIGHT:
         yield f"{beside:.0%} of the light passes beside the lenses: see whether there are clear gaps between them"
     if (moved_um := figures.get("lens_moved_um", 0.0)) > MAX_MOVED_UM:
@@ -55,13 +56,14 @@ def lenses_without_spot(spots: Spots, lenses: Lenses) -> list[int]:
 def shift_um(before_um: Places, after_um: Places) -> float | None:
     """Return the rms change along an axis of the places of spots, beside a shift and rotation of all, um.
 
-    None if their numbers differ.
+    None if less than half of them are found again.
     """
-    if len(before_um) != len(after_um):
-        return None
     placed = _aligned(before_um, after_um)
-    own = _distances(placed, after_um).argmin(axis=1)
-    return float(np.sqrt(np.square(placed - after_um[own]).mean()))
+    apart_um = _distances(placed, after_um)
+    is_own = apart_um.min(axis=1) < SAME_SPOT_UM
+    if is_own.mean() < 0.5:
+        return None
+    return float(np.sqrt(np.square(placed - after_um[apart_um.argmin(axis=1)])[is_own].mean()))
 
 
 def _aligned(places: Places, spots: Places) -> Places:
