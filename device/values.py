@@ -202,18 +202,24 @@ class Sensor:
     bend_per_dn: float = 0.0
 
 
+LENS_RINGS = 3  # of the mean over a field; a tenth of them
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Scale between degrees at the eye and pixels; paper, section "Optical design", first-order optics.
 
     `measured_scale_per_dpt` is the measured value of this head, from a moved point source (`calibration/dioptres.py`);
-    None if not measured.
+    None if not measured. `lens_focus_dpt` is the mean sphere of the eye for which its lenslets are in focus by the
+    drawings, None: no lenslets; `lens_index` is the index of their plate, None: they have a flat field.
     """
 
     pitch_um: float
     diffuser_to_sensor_um: float
     angular_magnification: float
     measured_scale_per_dpt: float | None = None
+    lens_focus_dpt: float | None = field(default=None, repr=False)  # a calibration without it keeps its identity
+    lens_index: float | None = field(default=None, repr=False)
 
     @property
     def px_per_deg(self) -> float:
@@ -225,6 +231,19 @@ class Geometry:
         """Relative shrinking of the caustic per dioptre of myopia: measured, else nominal."""
         measured = self.measured_scale_per_dpt
         return self.nominal_scale_per_dpt if measured is None else measured
+
+    def lens_excess_dpt(self, field_deg: float) -> NDArray[np.float64]:
+        """Return the excess M, J0, J45 in dpt of lenslets at places that stand for a field of view, (places, 3).
+
+        OPTICS.md 2.9: grows with the square of the tangent; places of equal area in LENS_RINGS rings.
+        """
+        if self.lens_index is None or self.lens_focus_dpt is None or field_deg == 0:
+            return np.zeros((1, 3))
+        squared = np.tan(np.deg2rad(self.angular_magnification * field_deg / 2)) ** 2
+        power_dpt = 1e6 / (self.diffuser_to_sensor_um * self.angular_magnification**2) - self.lens_focus_dpt
+        edge_dpt = squared / 2 * power_dpt * (2 + 1 / self.lens_index)
+        rings = (np.arange(LENS_RINGS) + 0.5) / LENS_RINGS
+        return np.stack([rings * edge_dpt, 0 * rings, 0 * rings], axis=1)
 
     @property
     def nominal_scale_per_dpt(self) -> float:

@@ -785,20 +785,27 @@ def optics(
     search: Annotated[
         bool, typer.Option("--search", help="Search LEDs, ring, iris and exposure for enough light.")
     ] = False,
+    design: Annotated[
+        bool, typer.Option("--design", help="Search lenslets in place of the diffuser, for the head's own light.")
+    ] = False,
+    layout: Annotated[Path | None, typer.Option(help="Where --design writes the best layout, CSV.")] = None,
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
     from services.research.reconstruct_file import write_or_raise
-    from services.workshop import head_search, light_path_plot, light_report
+    from services.workshop import head_search, lens_search, light_path_plot, light_report
     from services.workshop import optics_report as budget
 
     if head is not None and sensor is not None:
         raise typer.BadParameter("choose --head or --sensor, not both")
     if head is None and sensor is None:
-        if svg or light or light_svg or search or eye_mm is not None or pupil_mm is not None:
+        if svg or light or light_svg or search or design or eye_mm is not None or pupil_mm is not None:
             raise typer.BadParameter("choose --head or --sensor")
         typer.echo(budget.comparison())
         return
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
+    if design:
+        lens_search.design_layout(chosen, layout, typer.echo)
+        return
     report = head_search.table if search else budget.table
     typer.echo(light_report.table(chosen, frames) if light and not search else report(chosen))
     if light_svg is not None:

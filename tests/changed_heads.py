@@ -10,7 +10,7 @@ from scipy import ndimage
 from device.clock import VirtualClock
 from device.config.head_file import load_head
 from device.optics.diffuser import Beam, Refraction, caustic_on, grid_for
-from device.sim.render import cached_caustic, convolved
+from device.sim.render import cached_psf, convolved
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, Counts, Image
@@ -35,7 +35,7 @@ def calibrated() -> Calibration:
 def caustic_of_eye(m_dpt: float = 0.0, diffuser: int = 1, turned_deg: float = 0.0, z_um: float = 6000.0) -> Image:
     """Return the caustic of an eye with mean sphere `m_dpt` for another, rotated or moved diffuser."""
     optics = world().scene.optics.model_copy(update={"diffuser_to_sensor_um": z_um})
-    caustic = cached_caustic(optics, world().geometry.pitch_um, diffuser, Refraction(m_dpt), 1, None)
+    caustic = cached_psf(optics, world().geometry.pitch_um, diffuser, Refraction(m_dpt), 1, None)
     if not turned_deg:
         return caustic
     return np.asarray(ndimage.rotate(np.pad(caustic, 4), turned_deg, reshape=False, order=3), np.float32)

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from device.config.element import ElementSpec
 from device.config.radiometry import RadiometrySpec
 from device.config.scene import SimSpec
 from device.config.sensors import sensor_profile
@@ -238,12 +239,24 @@ class OpticsSpec(Table):
     field_deg: float = Field(default=33.4, gt=0, le=90)  # beyond, a degree is no longer a number of pixels (Geometry)
     wavelength_um: float = Field(default=0.55, gt=0.3, lt=1.2)
     bandwidth_um: float = Field(default=0.04, ge=0, lt=0.2)
-    slope_fwhm_deg: float = Field(default=0.5, gt=0, lt=20)
-    correlation_um: float = Field(default=70.0, gt=0)
+    element: ElementSpec = ElementSpec()
+
+    @model_validator(mode="after")
+    def _check_element(self) -> "OpticsSpec":
+        """Raise ValueError for lenses that do not fit the iris or the plate."""
+        self.element.check_iris(self.iris_um)
+        return self
 
     def geometry(self, pitch_um: float) -> Geometry:
         """Return the scale between degrees at the eye and pixels of a sensor with that pixel pitch."""
-        return Geometry(pitch_um, self.diffuser_to_sensor_um, self.angular_magnification)
+        powers = [1 / self.diffuser_to_sensor_um - 1 / focal_um for *_, focal_um in self.element.lenses]
+        focus_dpt = 1e6 * sum(powers) / len(powers) / self.angular_magnification**2 if powers else None
+        scales = pitch_um, self.diffuser_to_sensor_um, self.angular_magnification
+        return Geometry(
+            *scales,
+            lens_focus_dpt=focus_dpt,
+            lens_index=None if not powers or self.element.flat_field else self.element.index,
+        )
 
 
 class ReplaySpec(Table):

@@ -171,16 +171,13 @@ class SensorFlaws(Table):
     bayer: bool = False  # a colour sensor under one colour of light
 
 
-class DiffuserSpec(Table):
-    """Element at the iris: the random surface of [optics], or lenses that focus on the sensor (OPTICS.md 2.8).
+class ElementFlaws(Table):
+    """Flaws of lenslets at the iris (OPTICS.md 2.9): as made, which a calibration sees, and moved since then."""
 
-    `microlenses` is a square array, `lenslets` are placed at random, equal in focal length. `pitch_um` is the side of a
-    lens, or of the square that a lenslet has on average; `focal_um` None: the distance from the element to the sensor.
-    """
-
-    kind: Literal["diffuser", "microlenses", "lenslets"] = "diffuser"
-    pitch_um: float = Field(default=400.0, ge=100, le=2000)
-    focal_um: float | None = Field(default=None, ge=1000, le=100000)
+    focal_spread: float = Field(default=0.0, ge=0, le=0.3)  # standard deviation of the focal lengths, relative
+    surface_waves: float = Field(default=0.0, ge=0, le=1)  # rms wavefront error of each lens, wavelengths
+    centre_um: float = Field(default=0.0, ge=0, le=50)  # standard deviation of the centres along each axis
+    moved_um: float = Field(default=0.0, ge=0, le=50)  # of the centres since the calibration
 
 
 class CalibrationSpec(Table):
@@ -229,7 +226,7 @@ EffectTables = Annotated[
 
 
 class SimSpec(Table):
-    """Scene: object, eye, light, sensor, element at the iris, and calibration of a simulated head.
+    """Scene: object, eye, light, sensor, flaws of lenslets, and calibration of a simulated head.
 
     `peak_e` is the charge of the brightest pixel in one exposure in green at full drive, electrons; "budget" takes the
     light of a human eye from the light budget of the head's LEDs, their measured light if the head file has it
@@ -243,7 +240,7 @@ class SimSpec(Table):
     eye: EyeSpec = EyeSpec()
     light: LightFlaws = LightFlaws()
     sensor: SensorFlaws = SensorFlaws()
-    diffuser: DiffuserSpec = DiffuserSpec()
+    element: ElementFlaws = ElementFlaws()
     calibration: CalibrationSpec = CalibrationSpec()
     effects: EffectTables = Field(default_factory=dict)
 

@@ -127,7 +127,9 @@ def line_of(text: str, keys: list[str]) -> int | None:
         if header := re.match(r"\s*(\[+)\s*([^\]]+?)\s*\]+", line):
             table = header[2] if header[1] == "[" else f"{header[2]}.{times[header[2]]}"
             times[header[2]] += 1
-            if table == ".".join(keys) or table == ".".join(keys[:-1]):
+            if table == ".".join(keys):
+                return number
+            if table == ".".join(keys[:-1]):
                 found = found or number
         elif (entry := re.match(r"\s*['\"]?([\w.-]+)['\"]?\s*=", line)) and (
             f"{table}.{entry[1]}".lstrip(".") == ".".join(keys)

@@ -1,4 +1,4 @@
-"""Element at the iris: a smooth random surface or lenslets, and the wave-optics PSF of a retinal point behind it.
+"""Diffuser at the iris: a smooth random surface, and the wave-optics PSF of a retinal point behind it.
 
     opd_sigma_um   roughness of the surface, from the scattering angle in its data sheet
     surface        one realisation of the surface
@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from device.config.head_file import OpticsSpec
-from device.config.scene import DiffuserSpec
 from device.errors import SpecError
-from device.optics import lenslets
 from device.optics.propagation import Field, propagate, require_sampling
 from device.values import Image
 
@@ -61,7 +59,6 @@ class Refraction(NamedTuple):
 
 
 EMMETROPIA = Refraction()
-RANDOM_SURFACE = DiffuserSpec()
 
 
 @dataclass(frozen=True)
@@ -91,37 +88,28 @@ class Grid:
 
 def slope_sigma(optics: OpticsSpec) -> float:
     """Return the standard deviation of the optical slope along one axis, radians."""
-    return math.radians(optics.slope_fwhm_deg) / FWHM_PER_SIGMA
+    return math.radians(optics.element.slope_fwhm_deg) / FWHM_PER_SIGMA
 
 
 def opd_sigma_um(optics: OpticsSpec) -> float:
     """Return the standard deviation of the optical path difference, um; OPTICS.md 2.1: sigma_th * ell / sqrt(2)."""
-    return slope_sigma(optics) * optics.correlation_um / math.sqrt(2)
+    return slope_sigma(optics) * optics.element.correlation_um / math.sqrt(2)
 
 
-def steepest_rad(
-    optics: OpticsSpec, refraction: Refraction = EMMETROPIA, element: DiffuserSpec = RANDOM_SURFACE
-) -> float:
-    """Return the steepest ray behind the element, rad, plus the eye's slope at the iris.
-
-    Of a random surface five sigma of its slope, of lenslets the ray of the farthest corner of a lens.
-    """
+def steepest_rad(optics: OpticsSpec, refraction: Refraction = EMMETROPIA) -> float:
+    """Return the steepest ray behind the diffuser, rad: five sigma of its slope, plus the eye's slope at the iris."""
     m, j0, j45 = refraction
     eye = optics.angular_magnification**2 * (abs(m) + math.hypot(j0, j45)) * optics.iris_um / 2 * 1e-6
-    if element.kind != "diffuser":
-        return lenslets.steepest_rad(element, optics.diffuser_to_sensor_um) + eye
     return MAX_SLOPE_SIGMAS * slope_sigma(optics) + eye
 
 
-def grid_for(
-    optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMETROPIA, element: DiffuserSpec = RANDOM_SURFACE
-) -> Grid:
+def grid_for(optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMETROPIA) -> Grid:
     """Return a grid, as small as possible, whose samples are a whole fraction of a pixel and resolve the caustic.
 
     SpecError if that needs more than 4096 samples a side, or if the correlation length exceeds a quarter of the grid.
     """
-    angle = steepest_rad(optics, refraction, element)
-    coarsest_um = min(SAMPLING_FRACTION * optics.wavelength_um / (2 * angle), optics.correlation_um / 4)
+    angle = steepest_rad(optics, refraction)
+    coarsest_um = min(SAMPLING_FRACTION * optics.wavelength_um / (2 * angle), optics.element.correlation_um / 4)
     step = math.ceil(pitch_um / coarsest_um)
     extent_um = WINDOW_MARGIN * (optics.iris_um + 2 * optics.diffuser_to_sensor_um * angle)
     fringes_um = optics.wavelength_um * optics.diffuser_to_sensor_um * step / pitch_um
@@ -132,16 +120,11 @@ def grid_for(
             "Choose a smaller slope, iris or distance, or a longer correlation of the diffuser.",
         )
     grid = Grid(fft.next_fast_len(needed, real=True), step, pitch_um)
-    if optics.correlation_um > grid.pixels * pitch_um / 4:
-        raise SpecError(f"a surface that is correlated over {optics.correlation_um:g} um is no diffuser in this iris")
+    if optics.element.correlation_um > grid.pixels * pitch_um / 4:
+        raise SpecError(
+            f"a surface that is correlated over {optics.element.correlation_um:g} um is no diffuser in this iris"
+        )
     return grid
-
-
-def element_path_um(optics: OpticsSpec, grid: Grid, seed: int, element: DiffuserSpec) -> Image:
-    """Return the optical path difference of the element at the iris, um, float32 (samples, samples)."""
-    if element.kind == "diffuser":
-        return surface(optics, grid, seed)
-    return lenslets.path_um(element, optics.diffuser_to_sensor_um, optics.iris_um, grid.x_um, seed)
 
 
 def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
@@ -151,7 +134,7 @@ def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
     numbers are the amplitudes of the surface's spatial frequencies and not its samples.
     """
     window_um = grid.samples * grid.dx_um
-    ell_um = optics.correlation_um
+    ell_um = optics.element.correlation_um
     waves = min(math.ceil(window_um * 1.7 / ell_um), (grid.samples - 1) // 2)  # beyond: below 1e-6 of the longest
     order = np.arange(-waves, waves + 1)
     f_squared = (order[:, None] ** 2 + order[None, :] ** 2) / window_um**2
@@ -173,7 +156,6 @@ def caustic(
     refraction: Refraction = EMMETROPIA,
     lines: int = 3,
     beam: Beam | None = None,
-    element: DiffuserSpec = RANDOM_SURFACE,
 ) -> Image:
     """Return the intensity on the sensor from one retinal point on the axis by wave optics: float32 (n, n), sum 1.
 
@@ -182,7 +164,7 @@ def caustic(
     that of a relaxed eye, because another window would hold another surface. SpecError if no grid samples the light
     sufficiently, or if the grid cannot carry so strong a refraction. OPTICS.md 2.2.
     """
-    return caustic_on(grid_for(optics, pitch_um, element=element), optics, seed, refraction, lines, beam, element)
+    return caustic_on(grid_for(optics, pitch_um), optics, seed, refraction, lines, beam)
 
 
 def caustic_on(
@@ -192,7 +174,6 @@ def caustic_on(
     refraction: Refraction = EMMETROPIA,
     lines: int = 3,
     beam: Beam | None = None,
-    element: DiffuserSpec = RANDOM_SURFACE,
 ) -> Image:
     """Return the result of `caustic` on a given grid, (pixels, pixels); SpecError for a grid too coarse or small."""
     require_sampling(
@@ -201,9 +182,9 @@ def caustic_on(
         wavelength_um=optics.wavelength_um,
         distance_um=optics.diffuser_to_sensor_um,
         aperture_um=optics.iris_um,
-        angle_rad=steepest_rad(optics, refraction, element),
+        angle_rad=steepest_rad(optics, refraction),
     )
-    path_um = element_path_um(optics, grid, seed, element) + eye_wavefront_um(optics, grid, refraction)
+    path_um = surface(optics, grid, seed) + eye_wavefront_um(optics, grid, refraction)
     amplitude = iris(optics, grid)
     passed = 1.0
     if beam is not None:
@@ -215,7 +196,7 @@ def caustic_on(
         field: Field = amplitude * np.exp(np.complex64(2j * np.pi / wavelength_um) * path_um)
         carried = propagate(field, grid.dx_um, wavelength_um, optics.diffuser_to_sensor_um)
         intensity += carried.real**2 + carried.imag**2
-    return _onto_pixels(intensity, grid) * np.float32(passed)
+    return onto_pixels(intensity, grid) * np.float32(passed)
 
 
 def spectral_lines_um(optics: OpticsSpec, lines: int) -> list[float]:
@@ -246,7 +227,7 @@ def eye_wavefront_um(optics: OpticsSpec, grid: Grid, refraction: Refraction) -> 
     return wavefront
 
 
-def _onto_pixels(intensity: Image, grid: Grid) -> Image:
+def onto_pixels(intensity: Image, grid: Grid) -> Image:
     """Return the intensity on the pixels, (pixels, pixels), sum 1: exact average over each sample, then block sum."""
     f_rows = fft.fftfreq(grid.samples)
     f_cols = fft.rfftfreq(grid.samples)

@@ -54,6 +54,7 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.kernels import Pixels, Places
 from device.recon.model.resampling import to_sensor
+from device.recon.model.spots import without_noise
 from device.recon.stage import QuickLook, Recipe, Stage, StageResult, Step, default_schedule
 from device.values import Calibration, Image, Reconstruction, RefractionOffset, Report
 
@@ -125,6 +126,7 @@ class Reconstructor:
         recipes = recipes or default_schedule(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
             raise SettingError("a sample is made of at least one pixel")
+        calibration = without_noise(calibration)
         self.calibration = calibration
         self.shape = shape
         self.clock = clock

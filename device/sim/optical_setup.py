@@ -21,6 +21,7 @@ from device.errors import SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction
 from device.optics.illumination import MEAN_OVER_PEAK, PEAK_UM
 from device.optics.led_cap import LedCap, dark_deg
+from device.optics.lenslets import IDEAL, LensState
 from device.optics.lit_angle import cap_of
 from device.sim.fundus import Fundus
 from device.sim.head_light import HeadLight, head_light
@@ -200,7 +201,7 @@ class CalibrationDifference:
 
 
 @dataclass
-class OpticalSetup:
+class OpticalSetup:  # size: one attribute for each thing that an effect changes
     """Light path, ideal when built: a green object, one wavelength, a sensor without noise or flaws.
 
     `object` is the radiance on a square as wide as the light. `aberrations` and `beams` map a place in the field to the
@@ -215,6 +216,7 @@ class OpticalSetup:
     sensor: SensorModel
     object: Image = field(init=False)
     optics: OpticsSpec = field(init=False)
+    lenses: LensState = IDEAL
     lines: int = 1
     refraction: Refraction = EMMETROPIA
     aberrations: dict[str, Callable[[Place], Refraction]] = field(default_factory=dict)

@@ -20,6 +20,7 @@ from device.sim.sensor import SensorModel
 from device.values import SimulatedEffects
 
 ETA_THRESHOLD = 0.05
+_OF_A_DIFFUSER = "the eta is a diffuser's, so simulated"  # OPTICS.md 2.9: none is measured behind lenslets
 
 
 class Decision(NamedTuple):
@@ -46,7 +47,8 @@ def decide(
 ) -> tuple[Decision, ...]:
     """Return the decision on every effect, in the order of the light path; nothing is rendered.
 
-    By default the smallest effects are skipped as long as their joint eta stays below 0.05, and the others simulated.
+    By default the smallest effects are skipped as long as their joint eta stays below 0.05, and the others simulated;
+    behind lenslets, whose etas are not measured, only those of eta 0 are skipped.
     `everything` selects all effects, `only` just those named; `without` excludes those named in every case. `effects`:
     those to decide; None: the built-in ones, then those of plug-ins that the scene names. SettingError for
     `everything` with `only`, for a name that no effect has, or for a plug-in that fails.
@@ -57,6 +59,11 @@ def decide(
     _refuse_unknown_names([*only, *without], [effect.name for effect in effects])
     sizes = [effect.size(scene) for effect in effects]
     skipped = _negligible(sizes)
+    if scene.optics.element.kind == "lenslets":
+        for place in sorted(skipped):
+            if sizes[place].eta > 0:
+                skipped.remove(place)
+                sizes[place] = sizes[place]._replace(why=f"{sizes[place].why}; {_OF_A_DIFFUSER}")
     decisions = []
     for place, (effect, size) in enumerate(zip(effects, sizes, strict=True)):
         chosen = everything or (effect.name in only if only else place not in skipped)

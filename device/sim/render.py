@@ -6,7 +6,7 @@ the solver's operator (no inverse crime).
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from math import atan2, ceil, cos, hypot, pi, sin
+from math import atan2, ceil, cos, hypot, pi, radians, sin, tan
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +14,8 @@ from scipy import fft
 from scipy.special import j1
 
 from device.config.head_file import OpticsSpec
-from device.config.scene import DiffuserSpec
-from device.optics.diffuser import RANDOM_SURFACE, Beam, Refraction, caustic
+from device.optics.diffuser import Beam, Refraction, caustic
+from device.optics.lenslets import IDEAL, LensState, Slope, spots
 from device.sim.optical_setup import Ghost, OpticalSetup, Place
 from device.values import Image
 
@@ -83,23 +83,43 @@ def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
     scene = setup.scene
     pitch_um = scene.spec.camera.pitch_um
     with setup.timed(*(["bandwidth"] if setup.lines > 1 else [])):
-        return cached_caustic(
-            setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam, scene.sim.diffuser
+        return cached_psf(
+            setup.optics,
+            pitch_um,
+            scene.seed,
+            Refraction(m, j0, j45),
+            setup.lines,
+            beam,
+            setup.lenses,
+            _slope_at_iris(setup, place),
         )
 
 
+def _slope_at_iris(setup: OpticalSetup, place: Place) -> Slope:
+    """Return the tangent (right, down) of the angle at which the light of a place meets curved lenses; else (0, 0)."""
+    if not setup.lenses.curved:
+        return 0.0, 0.0
+    turn, angle_deg = azimuth_and_angle(place)
+    tangent = tan(radians(setup.optics.angular_magnification * angle_deg))
+    return tangent * cos(turn), tangent * sin(turn)
+
+
 @lru_cache(maxsize=4)
-def cached_caustic(
+def cached_psf(
     optics: OpticsSpec,
     pitch_um: float,
     seed: int,
     refraction: Refraction,
     lines: int,
     beam: Beam | None,
-    element: DiffuserSpec = RANDOM_SURFACE,
+    lenses: LensState = IDEAL,
+    slope: Slope = (0.0, 0.0),
 ) -> Image:
-    """Return the PSF of `caustic` as a read-only array, from a cache of the last four sets of arguments."""
-    point = caustic(optics, pitch_um, seed, refraction, lines, beam, element)
+    """Return the PSF of the head's element as a read-only array, from a cache of the last four sets of arguments."""
+    if optics.element.kind == "lenslets":
+        point = spots(optics, pitch_um, seed, refraction, lines, beam, lenses.flaws, slope)
+    else:
+        point = caustic(optics, pitch_um, seed, refraction, lines, beam)
     point.flags.writeable = False
     return point
 
@@ -154,7 +174,7 @@ def zones(setup: OpticalSetup) -> Iterator[Zone]:
     """Yield the isoplanatic zones of the object; only one for a point, or if no effect varies over the field."""
     spec = setup.scene.sim.object
     gaze = setup.scene.sim.eye.gaze_deg
-    if not setup.aberrations and not setup.beams:
+    if not setup.aberrations and not setup.beams and not setup.lenses.curved:
         yield Zone((0.0, 0.0), setup.object)
     elif spec.kind == "point":  # a point has exactly one PSF
         yield Zone((spec.at_deg[0] + gaze[0], spec.at_deg[1] + gaze[1]), setup.object)

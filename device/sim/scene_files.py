@@ -37,9 +37,9 @@ class SimulatedExposure:
     calibration: Calibration
 
 
-def simulate_exposure(spec: InstrumentSpec) -> SimulatedExposure:
+def simulate_exposure(spec: InstrumentSpec, choose: EffectSelector = decide) -> SimulatedExposure:
     """Return a lit frame in the picture's colour with ground truth; SpecError for a spec without [optics] or [sim]."""
-    world = World(spec, VirtualClock())
+    world = World(spec, VirtualClock(), choose=choose)
     colour = spec.light.colour
     (counts,) = lit_frames(world)
     mask = world.retina.vessels

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from device.optics import lenslets
 from device.optics.diffuser import Refraction, steepest_rad
 from device.optics.eye import correction_dpt
 from device.optics.lit_angle import picture_field_deg
@@ -69,6 +70,8 @@ def calibration_point(world: World, moved_mm: float = 0.0, colour: Colour | None
     eye_mm = world.scene.sim.eye.focal_length_um / 1000
     point_setup = OpticalSetup(setup.scene, setup.subject, setup.sensor, lines=setup.lines)
     longer_dpt = -correction_dpt(eye_mm + moved_mm, eye_mm)
+    flaws = setup.lenses.flaws.model_copy(update={"moved_um": 0.0})
+    point_setup.lenses = lenslets.LensState(flaws, setup.lenses.curved)
     point_setup.refraction = Refraction(spec.m_dpt + longer_dpt, spec.j0_dpt, spec.j45_dpt)
     if spec.diffuser_to_sensor_um is not None:
         point_setup.optics = setup.optics.model_copy(update={"diffuser_to_sensor_um": spec.diffuser_to_sensor_um})
@@ -94,8 +97,10 @@ def _pedestal(image: Image, world: World) -> np.float32:
     0 if the caustic reaches every pixel.
     """
     optics = world.scene.optics
-    steepest = steepest_rad(optics, element=world.scene.sim.diffuser)
-    reach_um = optics.iris_um / 2 + optics.diffuser_to_sensor_um * steepest
+    if optics.element.kind == "lenslets":
+        reach_um = lenslets.reach_um(optics)
+    else:
+        reach_um = optics.iris_um / 2 + optics.diffuser_to_sensor_um * steepest_rad(optics)
     rows, cols = (np.arange(size, dtype=np.float32) - size // 2 for size in image.shape)
     outside = np.hypot(rows[:, None], cols[None, :]) * np.float32(world.geometry.pitch_um) > reach_um
     return np.float32(image[outside].mean(dtype=np.float64)) if outside.any() else np.float32(0)

@@ -116,6 +116,8 @@ def _light(chosen: Design, budget: OpticalBudget) -> list[Row]:
         note = "no light of this ring passes the pupil"
     elif not budget.within_simulated_range and budget.electrons_per_px * (5.04 / chosen.pitch_um) ** 2 > 2e3:
         note = "photon-limited; so much light was never simulated"
+    if chosen.optics.element.kind == "lenslets":
+        note = "of a diffuser's picture; behind lenslets it is finer, and not known"
     known = "as measured" if chosen.measured else "a guess within a factor of two"
     inside = f"of it {chosen.share_in_pupil:.2f} in a pupil of {chosen.pupil_mm:g} mm"
     return [

@@ -10,7 +10,7 @@ from scipy import fft
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.sim.plan import decide
-from device.sim.render import cached_caustic, electrons_per_s
+from device.sim.render import cached_psf, electrons_per_s
 from device.sim.world import World
 from tests.bench import timing
 
@@ -51,7 +51,7 @@ def median_ms(world: World, *, fresh: bool) -> float:
     times = []
     for _ in range(TURNS):
         if fresh:
-            cached_caustic.cache_clear()
+            cached_psf.cache_clear()
         begin = time.perf_counter()
         electrons_per_s(world.setup(world.spec.light.colour))
         times.append(time.perf_counter() - begin)

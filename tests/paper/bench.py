@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from device.clock import SystemClock
+from device.config.element import Lenses
 from device.config.head_file import InstrumentSpec, load_head
 from device.recon.assessment.metrics import PictureScorer, Scores
 from device.recon.estimation.defective_pixels import DefectFinder
@@ -26,6 +27,8 @@ from device.recon.model.resampling import to_sensor
 from device.recon.reconstructor import Reconstructor
 from device.recon.solvers.flat_field_correction import flat_field_correct
 from device.recon.solvers.wiener import TIKHONOV, ClosedForm
+from device.sim.eyes import EffectSelector
+from device.sim.plan import decide
 from device.sim.scene_files import SimulatedExposure, simulate_exposure
 from device.values import Calibration, Image, Mask, Report
 from services import resources
@@ -39,7 +42,7 @@ EVEN_DEG, DETAIL_DEG = 4.0, 2.0
 DEFAULT, SCHEDULE = "our default", "the default schedule"  # names of solvers in the report, explained in style.GLOSSARY
 
 ProgressCallback = Callable[[str], None]
-HeadChanges: TypeAlias = Mapping[str, bool | int | float | str | tuple[float, float]]  # by dotted keys
+HeadChanges: TypeAlias = Mapping[str, bool | int | float | str | tuple[float, float] | Lenses]  # by dotted keys
 
 
 class Bench:
@@ -58,11 +61,13 @@ class Bench:
         """
         return with_merged_pixels(with_changes(load_head(SCENES / f"{name}.toml"), changes or {}), self.merged)
 
-    def expose(self, name: str, changes: HeadChanges | None = None) -> "SimulatedFrame":
-        """Return one frame of a scene with changes."""
+    def expose(
+        self, name: str, changes: HeadChanges | None = None, choose: EffectSelector = decide
+    ) -> "SimulatedFrame":
+        """Return one frame of a scene with changes; `choose` selects its effects."""
         spec = self.scene(name, changes)
         assert spec.sim is not None
-        return SimulatedFrame(spec.name, simulate_exposure(spec), spec.sim.object.cut_deg)
+        return SimulatedFrame(spec.name, simulate_exposure(spec, choose), spec.sim.object.cut_deg)
 
     def solve(self, take: "SimulatedFrame", name: str) -> Image:
         """Return the picture by our method `name` with the calibrated PSF, on the samples of the scores."""

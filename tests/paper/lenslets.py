@@ -6,18 +6,22 @@ The pitch was chosen on seed 11, which is none of these (OPTICS.md 2.8).
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from device.config.scene import DiffuserSpec
+from device.config.element import Lenses, half_widths_um
+from device.sim.plan import decide
 from device.values import Image
+from tests.lens_packing import random_packing, square_array
 from tests.paper.bench import Bench, HeadChanges, SimulatedFrame
 from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above
 from tests.paper.pictures import plane
 
 SCENE, SEEDS = "human_eye_paper", (21, 22, 23)
 KINDS = ("diffuser", "microlenses", "lenslets")
+PITCH_UM, IRIS_UM, FOCAL_UM = 400.0, 3200.0, 6000.0
 NAMES = {"diffuser": "diffuser", "microlenses": "square array", "lenslets": "aperiodic lenslets"}
 BAND_CYCLES_PER_MM = (5.0, 14.5)  # of the sensor: vessels of 90 to 260 um on the retina of a human eye
 MYOPIA_DPT = 4.0  # the paper's tolerance
@@ -48,6 +52,13 @@ class Trial(NamedTuple):
         return found.pcc, found.psnr_db, found.vessel_contrast
 
 
+def lenses(kind: str, seed: int) -> Lenses:
+    """Return the lenses of a square array or of a random packing; `seed` draws the latter."""
+    places = square_array(PITCH_UM, IRIS_UM) if kind == "microlenses" else random_packing(PITCH_UM, IRIS_UM, seed)
+    found = tuple((float(right), float(down), FOCAL_UM) for right, down in places)
+    return tuple(lens for lens, half_um in zip(found, half_widths_um(found, IRIS_UM), strict=True) if half_um)
+
+
 def passed_detail(take: SimulatedFrame) -> Passed:
     """Return the transfer of detail from object to frame by the calibrated PSF of a take, of sum 1."""
     assert take.calibration.geometry is not None
@@ -67,8 +78,10 @@ def trial(bench: Bench, kind: str, seed: int, m_dpt: float = 0.0) -> Trial:
     The frame of an eye with a refractive error is solved by the default schedule, which estimates it.
     """
     bench.progress(f"D: {NAMES[kind]}, eye {seed}" + (f", {m_dpt:+g} dpt" if m_dpt else ""))
-    changes: HeadChanges = {"sim.seed": seed, "sim.diffuser.kind": kind, "sim.eye.m_dpt": m_dpt}
-    take = bench.expose(SCENE, changes)
+    changes: HeadChanges = {"sim.seed": seed, "sim.eye.m_dpt": m_dpt}
+    if kind != "diffuser":
+        changes = {**changes, "optics.element.kind": "lenslets", "optics.element.lenses": lenses(kind, seed)}
+    take = bench.expose(SCENE, changes, partial(decide, without=("lens_curvature",)))
     picture = bench.solve_default(take)[0] if m_dpt else bench.solve(take, "variation")
     return Trial(take, picture, passed_detail(take))
 
@@ -164,9 +177,9 @@ def _notes(gains: dict[str, list[float]], strained: dict[str, Trial]) -> tuple[s
     answer = (
         f"better than the diffuser in every eye: {', '.join(better)}" if better else "none does better in every eye"
     )
-    pitch_um, eye = DiffuserSpec().pitch_um, {kind: f"{result.scores[0]:.3f}" for kind, result in strained.items()}
+    eye = {kind: f"{result.scores[0]:.3f}" for kind, result in strained.items()}
     return (
-        f"Does one do better at the light of a real eye? In this simulation: {answer}. A lens of {pitch_um:g} um "
+        f"Does one do better at the light of a real eye? In this simulation: {answer}. A lens of {PITCH_UM:g} um "
         "gathers the light of a point into one spot, so detail keeps about one over the root of their number; the "
         "diffuser spreads it over its whole caustic. The square array has the same spots in a lattice, whose transfer "
         "is uneven as the paper says, and whose copies of the retina the prior must tell apart.",

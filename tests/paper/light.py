@@ -70,8 +70,11 @@ def human_light(name: str) -> HumanLight:
 
 
 def shipped_heads() -> list[str]:
-    """Return the names of the head files without extension, without those that have no lamp."""
-    return [path.stem for path in files_in(resources.HEADS, "*.toml") if load_head(path).light.backend != "none"]
+    """Return the names of the head files with a lamp and a diffuser, without extension, and without their copies."""
+    paths = files_in(resources.HEADS, "*.toml")
+    heads = {path.stem: load_head(path) for path in paths if not path.stem.startswith("sim_")}
+    lit = {name: head.optics for name, head in heads.items() if head.light.backend != "none"}
+    return [name for name, optics in lit.items() if optics is None or optics.element.kind == "diffuser"]
 
 
 def head_pictures(bench: Bench, names: Sequence[str]) -> dict[str, HeadPictures]:

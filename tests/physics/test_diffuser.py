@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from device.config.element import ElementSpec
 from device.config.head_file import OpticsSpec
 from device.errors import SpecError
 from device.optics.diffuser import (
@@ -54,9 +55,9 @@ def test_the_surface_has_the_given_slopes_and_correlation():
     for axis in (0, 1):
         slopes = np.gradient(opd, PITCH_UM, axis=axis)
         assert slopes.std() == pytest.approx(slope_sigma(PAPER), rel=0.05)
-    shift = round(PAPER.correlation_um / PITCH_UM)
+    shift = round(PAPER.element.correlation_um / PITCH_UM)
     at_ell = correlation(opd, np.roll(opd, shift, 0))
-    assert at_ell == pytest.approx(np.exp(-((shift * PITCH_UM / PAPER.correlation_um) ** 2)), abs=0.05)
+    assert at_ell == pytest.approx(np.exp(-((shift * PITCH_UM / PAPER.element.correlation_um) ** 2)), abs=0.05)
 
 
 def test_the_surface_is_independent_of_the_sampling():
@@ -155,4 +156,4 @@ def test_every_pitch_gets_a_grid_that_divides_it(pitch_um):
 @pytest.mark.parametrize("wrong", [{"slope_fwhm_deg": 15.0}, {"correlation_um": 3.0}, {"correlation_um": 5000.0}])
 def test_a_diffuser_that_cannot_be_sampled_is_refused(wrong):
     with pytest.raises(SpecError):
-        caustic(PAPER.model_copy(update=wrong), PITCH_UM, 1)
+        caustic(PAPER.model_copy(update={"element": ElementSpec(**wrong)}), PITCH_UM, 1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
+from device.config.element import ElementSpec
 from device.config.head_file import load_head
 from device.optics.diffuser import Refraction, caustic_on, grid_for
 from device.sim.render import convolved_with_disc
@@ -30,7 +31,8 @@ def test_rays_and_waves_agree_after_a_blur(eye: Refraction) -> None:
 
 def test_without_a_diffuser_a_focusing_eye_makes_the_airy_disc() -> None:
     """A wavefront that converges onto the sensor: the first dark ring has the radius 1.22 lambda z / d."""
-    flat = OPTICS.model_copy(update={"slope_fwhm_deg": 1e-6, "iris_um": 400.0, "diffuser_to_sensor_um": 60000.0})
+    smooth = ElementSpec(slope_fwhm_deg=1e-6)
+    flat = OPTICS.model_copy(update={"element": smooth, "iris_um": 400.0, "diffuser_to_sensor_um": 60000.0})
     focus = Refraction(1 / (flat.diffuser_to_sensor_um * 1e-6 * flat.angular_magnification**2))
     grid = grid_for(flat, 8.0)
     spot = caustic_on(grid, flat, 1, focus, lines=1)

@@ -19,7 +19,10 @@ from tests.paper.bench import with_changes, with_merged_pixels
 from tests.simulated import SCENES, coarse, with_keys
 
 EYES = sorted(SCENES.glob("human_eye_*.toml"))
-LIT = sorted(path.stem for path in HEADS.glob("*.toml") if load_head(path).light.backend != "none")
+SIMULATED = sorted(HEADS.glob("sim_*.toml"))
+LIT = sorted(
+    path.stem for path in set(HEADS.glob("*.toml")) - set(SIMULATED) if load_head(path).light.backend != "none"
+)
 SIM = load_head(SCENES / "human_eye_sim.toml")
 
 
@@ -32,6 +35,14 @@ def light(spec: InstrumentSpec) -> float:
 
 def test_every_head_with_a_lamp_has_a_scene_of_a_human_eye_in_its_own_light() -> None:
     assert [path.stem.removeprefix("human_eye_") for path in EYES] == LIT
+
+
+@pytest.mark.parametrize("path", SIMULATED, ids=lambda path: path.stem)
+def test_simulated_head_has_the_optics_and_the_light_of_its_scene(path: Path) -> None:
+    head = load_head(path)
+    scene = load_head(SCENES / f"human_eye_imx296{path.stem.removeprefix('sim').removeprefix('_imx296')}.toml")
+    assert head.optics == scene.optics
+    assert light(head) == light(scene)
 
 
 @pytest.mark.parametrize("name", LIT)

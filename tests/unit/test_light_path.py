@@ -30,7 +30,7 @@ def unexplained(path: LightPath, spec: InstrumentSpec, text: str) -> list[str]:
     for table, key, here, there in others:
         line = line_of(text, [table, key])
         written = lines[line - 1] if line else ""
-        if here != there and not re.search(rf"{key} .*# deviates: .{{10,}}", written):
+        if here != there and not re.search(rf"{key}\b.*# deviates: .{{10,}}", written):
             found.append(f"{table}.{key} = {here}, not {there}")
     return found
 

@@ -26,6 +26,7 @@ from device.calibration.procedure.dioptres import (
 )
 from device.calibration.procedure.finished_steps import Step, StepCheckpoints
 from device.calibration.procedure.flats import MIN_SHARE, Flats, measure_flats
+from device.calibration.procedure.lens_check import lens_figures, lens_messages
 from device.calibration.procedure.moments import Moments
 from device.calibration.procedure.point_source import MotionCheck, PointSource, measure_point_source, refuse_level
 from device.calibration.procedure.raw_recorder import RawRecorder
@@ -33,9 +34,10 @@ from device.calibration.procedure.refraction_zero import ZeroCheck, compare_zero
 from device.calibration.procedure.step_exposures import SHORTEST_S, StepExposures
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
-from device.errors import CalibrationRefused
+from device.errors import CalibrationError, CalibrationRefused
 from device.optics.lit_angle import picture_field_deg
 from device.ports import Camera, Thermometer
+from device.recon.model.spots import find_spots
 from device.values import Calibration, Colour, Frame, Geometry, Psf, Sensor
 
 CalibrationTarget = Literal[
@@ -162,12 +164,16 @@ class CalibrationSequence:
         psfs, colours = self._colour_psfs(darks, flats, point)
         calibration = self._build_calibration(darks, flats, psfs, dioptres)
         calibration = replace(calibration, source_in_focus=in_focus and (zero is None or not zero.contradicts))
+        lenses = _lens_figures(self.job, archive, calibration)
+        for message in lens_messages(lenses):
+            self.operator.show_message(message)
         figures = (
             _measurement_figures(darks, flats, point)
             | self._dark_current_figures(archive, darks, flats)
             | _dioptre_figures(dioptres)
             | ({} if zero is None else zero.figures)
             | colours
+            | lenses
         )
         id = archive.add_and_activate(calibration, self._build_provenance(figures))
         if self.raw_recorder is not None:
@@ -212,13 +218,13 @@ class CalibrationSequence:
             def measure(moved_mm: float = moved_mm) -> PointSource:
                 disc_px = self._disc_px() * eye_mm / (eye_mm + moved_mm)
                 there = self._measure_point(darks, flats, AXIAL_BRACKETS, disc_px)
-                seen[moved_mm] = similarity_of_points(point, there, pitch_um)
+                seen[moved_mm] = similarity_of_points(point, there, pitch_um, geometry)
                 refuse_wrong_position(seen[moved_mm], moved_mm, eye_mm, geometry)
                 return there
 
             there = self._checkpointed_step(stand.replace(" ", ""), PointSource, stand, measure)
             if moved_mm not in seen:  # loaded from its checkpoint
-                seen[moved_mm] = similarity_of_points(point, there, pitch_um)
+                seen[moved_mm] = similarity_of_points(point, there, pitch_um, geometry)
         try:
             found = fit_dioptre_scale({moved_mm: seen_point.scale for moved_mm, seen_point in seen.items()}, eye_mm)
         except CalibrationRefused:
@@ -269,15 +275,19 @@ class CalibrationSequence:
         job = self.job
         own = dict[Colour, Psf]()
         figures = dict[str, float]()
+
+        def similarity(there: PointSource) -> PsfSimilarity:
+            return similarity_of_points(point, there, job.spec.camera.pitch_um, job.geometry)
+
         for colour in job.other_colours:
 
             def measure(colour: Colour = colour) -> PointSource:
                 there = self._measure_point(darks, flats)
-                refuse_moved_source(colour, similarity_of_points(point, there, job.spec.camera.pitch_um), job.geometry)
+                refuse_moved_source(colour, similarity(there), job.geometry)
                 return there
 
             there = self._checkpointed_step(f"point-{colour}", PointSource, COLOUR_TARGETS[colour], measure)
-            found = similarity_of_points(point, there, job.spec.camera.pitch_um)
+            found = similarity(there)
             figures |= {f"psf_{colour}_likeness": found.correlation, f"psf_{colour}_scale": found.scale}
             kept = "kept as a PSF of its own" if needs_separate_psf(found) else "the same PSF"
             self.operator.show_message(
@@ -370,6 +380,20 @@ def step_figures(step: Darks | Flats | PointSource) -> dict[str, float]:
         elif isinstance(value, np.ndarray) and value.dtype == bool:
             found[key] = float(value.sum())
     return found
+
+
+def _lens_figures(job: CalibrationJob, archive: Archive, calibration: Calibration) -> dict[str, float]:
+    """Return the figures of lenslets, beside the head's calibration before if there is one; none behind a diffuser."""
+    optics, geometry = job.spec.optics, calibration.geometry
+    spots = None if geometry is None else find_spots(calibration.psfs[0], geometry)
+    if optics is None or spots is None:
+        return {}
+    try:
+        before = archive.load()
+    except CalibrationError:  # none yet, or one that cannot be read
+        return lens_figures(spots, optics.element.lenses, None)
+    earlier = before.calibration if before.provenance.serial == job.serial else None
+    return lens_figures(spots, optics.element.lenses, earlier)
 
 
 def _measurement_figures(darks: Darks, flats: Flats, point: PointSource) -> dict[str, float]:

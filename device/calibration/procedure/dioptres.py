@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from device.calibration.procedure.point_source import PointSource
+from device.calibration.procedure.spot_similarity import fit_spots
 from device.errors import CalibrationRefused
 from device.recon.model.grid import support_radius_px
 from device.values import Geometry, Psf
@@ -54,11 +55,15 @@ def mean_sphere_dpt(moved_mm: float, eye_mm: float) -> float:
     return 1000 / eye_mm - 1000 / (eye_mm + moved_mm)
 
 
-def fit_similarity(of: Psf, into: Psf, pitch_um: float) -> PsfSimilarity:
+def fit_similarity(of: Psf, into: Psf, pitch_um: float, geometry: Geometry | None = None) -> PsfSimilarity:
     """Return the scale about the centre, and the shift in pixels, that turn the PSF `of` into the PSF `into`.
 
-    Coarse search over a grid of scales by cross-correlation, then least squares in scale, shift and brightness.
+    By the spots of lenslets, which `geometry` states. Else coarse search over a grid of scales by cross-correlation,
+    then least squares in scale, shift and brightness.
     """
+    by_spots = None if geometry is None else fit_spots(of, into, geometry)
+    if by_spots is not None:
+        return PsfSimilarity(*by_spots)
     n = max(1, round(SAMPLE_UM / pitch_um))
     radius = RADIUS_FACTOR * support_radius_px(of)
     reference, seen = (_binned_centre(psf, radius, n) for psf in (of, into))
@@ -77,12 +82,14 @@ def fit_similarity(of: Psf, into: Psf, pitch_um: float) -> PsfSimilarity:
     return PsfSimilarity(scale, (float(n * found[1]), float(n * found[2])), likeness)
 
 
-def similarity_of_points(first: PointSource, second: PointSource, pitch_um: float) -> PsfSimilarity:
+def similarity_of_points(
+    first: PointSource, second: PointSource, pitch_um: float, geometry: Geometry | None
+) -> PsfSimilarity:
     """Return scale and shift from one point-source measurement to another, with the true shift of the source.
 
     Both PSFs are centred, so the difference of their offsets is added to the fitted shift.
     """
-    found = fit_similarity(first.psf, second.psf, pitch_um)
+    found = fit_similarity(first.psf, second.psf, pitch_um, geometry)
     rows, cols = (a + b - c for a, b, c in zip(found.moved_px, second.off_px, first.off_px, strict=True))
     return replace(found, moved_px=(rows, cols))
 

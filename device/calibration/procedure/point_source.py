@@ -7,7 +7,7 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter
 from scipy.special import j1
 
 from device.calibration.procedure.darks import Darks
@@ -22,15 +22,17 @@ MIN_PEAK = 0.2  # of the converter range, in the shortest exposure: below it noi
 MAX_MOVED_PX = 0.5  # from the first frame
 MAX_PEDESTAL = 0.005  # of the PSF's sum (NUMERICS.md 3.5, item 6)
 CENTROID_THRESHOLD = 0.1  # of the peak: threshold of the centroid
+SPOT_THRESHOLD = 0.01  # of the brightest 3 x 3 pixels
+FEW_PIXELS = 0.03  # of the brightest 3 x 3 pixels: a caustic's 99.5th percentile has 0.22 to 0.83, spots' 0.007
 MIN_OTF = 0.1  # OTF of the disc: below it deconvolution would amplify noise, not sharpen
 
 
 @dataclass
 class MotionCheck:
-    """Motion check of the point source: records the centroid (row, col) of each frame, less the dark frame."""
+    """Motion check of the point source in its frames, less the dark frame, by their place against the first one."""
 
     dark_dn: Image
-    centroids_px: list[tuple[float, float]] = field(default_factory=list)
+    first: list[Image] = field(default_factory=list)
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the frames unchanged; CalibrationRefused once the centroid is over 0.5 pixels from its first place."""
@@ -40,10 +42,9 @@ class MotionCheck:
             yield frame
 
     def _note(self, frame: Frame) -> None:
-        self.centroids_px.append(centroid_px(frame.counts - self.dark_dn))
-        first = self.centroids_px[0]
-        last = self.centroids_px[-1]
-        if (moved_px := hypot(last[0] - first[0], last[1] - first[1])) > MAX_MOVED_PX:
+        light = frame.counts - self.dark_dn
+        self.first = self.first or [light]
+        if (moved_px := hypot(*_shift_px(self.first[0], light))) > MAX_MOVED_PX:
             raise CalibrationRefused(
                 f"the point source has moved by {moved_px:.1f} pixels by frame {frame.number}",
                 "Fix source and head to one table, let them rest, then start again.",
@@ -160,10 +161,42 @@ def deconvolve_disc(light: Image, disc_px: float) -> Image:
     return sharp.astype(np.float32)
 
 
+def _shift_px(first: Image, light: Image) -> tuple[float, float]:
+    """Return the shift (rows, cols) of the light from the first frame on.
+
+    By the centroids, but of spots, whose centroid moves by 0.15 pixels (rms) with the shot noise of each spot's light,
+    by the maximum of the correlation.
+    """
+    if not _is_of_spots(first):
+        (row, col), (last_row, last_col) = centroid_px(first), centroid_px(light)
+        return last_row - row, last_col - col
+    alike = fft.irfft2(fft.rfft2(light) * np.conj(fft.rfft2(first)), first.shape)
+    row, col = (int(place) for place in np.unravel_index(int(alike.argmax()), alike.shape))
+    return _vertex(alike[:, col], row), _vertex(alike[row], col)
+
+
+def _vertex(periodic: Image, place: int) -> float:
+    """Return the vertex of the parabola through a maximum and its neighbours, from -half the length to half of it."""
+    size = len(periodic)
+    before, middle, after = (float(periodic[(place + k) % size]) for k in (-1, 0, 1))
+    return (place + size // 2) % size - size // 2 + (before - after) / (2 * (before - 2 * middle + after))
+
+
+def _is_of_spots(light: Image) -> bool:
+    """Return whether the light fills so few pixels that the 99.5th percentile does not show it."""
+    return bool(np.percentile(light, 99.5) < FEW_PIXELS * uniform_filter(light, 3).max())
+
+
 def centroid_px(light: Image) -> tuple[float, float]:
-    """Return the centroid (row, col) of the light above a tenth of the peak; the peak is the 99.5th percentile."""
-    bright = np.clip(light, 0, np.percentile(light, 99.5))
-    bright -= np.float32(CENTROID_THRESHOLD) * bright.max()
+    """Return the centroid (row, col) of the light above a tenth of the peak; the peak is the 99.5th percentile.
+
+    Of spots: of the light above a hundredth of the brightest 3 x 3 pixels.
+    """
+    if _is_of_spots(light):  # the light of a spot is in proportion to its cell, so that the middle is the iris's
+        bright = light - np.float32(SPOT_THRESHOLD) * uniform_filter(light, 3).max()
+    else:
+        bright = np.clip(light, 0, np.percentile(light, 99.5))
+        bright -= np.float32(CENTROID_THRESHOLD) * bright.max()
     np.maximum(bright, 0, out=bright)
     total = max(float(bright.sum(dtype=np.float64)), 1e-30)
     rows, cols = (np.arange(size) for size in light.shape)

@@ -102,7 +102,7 @@ def compare_zero(earlier: StoredCalibration, psf: Psf, colour: Colour, geometry:
     calibration = earlier.calibration.for_colour(colour)
     if calibration.psfs[0].shape != psf.shape:
         return None
-    found = fit_similarity(calibration.psfs[0], psf, geometry.pitch_um)
+    found = fit_similarity(calibration.psfs[0], psf, geometry.pitch_um, geometry)
     if found.correlation < MIN_SAME_PATTERN:
         return ZeroCheck(earlier.calibration.id, found.correlation, None)
     offset = calibration.refraction_offset

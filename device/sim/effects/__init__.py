@@ -1,6 +1,6 @@
 """Registry of the simulated effects, in the order of the light path from lamp to counts; the calibration's last."""
 
-from device.sim.effects import eye, illumination, optics, sensor
+from device.sim.effects import eye, illumination, lenslets, optics, sensor
 from device.sim.effects.effect import Effect
 
 EFFECTS: tuple[Effect, ...] = (
@@ -22,6 +22,9 @@ EFFECTS: tuple[Effect, ...] = (
     eye.TearFilm(),
     optics.PupilVignetting(),
     optics.Bandwidth(),
+    lenslets.LensCurvature(),
+    lenslets.LensFlaws(),
+    lenslets.LensShift(),
     optics.SplitterGhost(),
     eye.Motion(),
     sensor.RollingShutter(),

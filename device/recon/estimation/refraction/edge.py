@@ -38,6 +38,7 @@ from device.recon.model.preprocessing import Linear
 from device.values import Calibration, Geometry, Image
 
 SAMPLE_UM = 24.0
+SPOT_SAMPLE_UM = 14.0  # behind lenslets, whose spots are in focus: 24 um refuse good frames of a bright head
 PARAMETERS = 4
 ROUNDING_STEP = 7  # every such row and column shows whether counts are whole numbers
 
@@ -93,7 +94,8 @@ class EdgeLikelihood:
         self._count = 0 if edge_is_known else PARAMETERS
         wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
         otf = InterpolatedOtf(calibration.psfs[index])
-        self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, otf, SAMPLE_UM)
+        sample_um = SAMPLE_UM if geometry.lens_focus_dpt is None else SPOT_SAMPLE_UM
+        self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, otf, sample_um)
         self.grid = self.likelihood.grid
         self.band: Band = self.likelihood.bands.whole
         self.prior = EdgePrior(calibration.field_deg, geometry.px_per_deg / self.grid.n)

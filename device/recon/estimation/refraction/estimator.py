@@ -34,9 +34,10 @@ from device.recon.estimation.refraction.pupil import Pupil, PupilFinder
 from device.recon.estimation.refraction.uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
-from device.recon.model.forward_model import Model
+from device.recon.model.forward_model import Model, otf
 from device.recon.model.grid import Pair, support_radius_px
 from device.recon.model.kernels import Pixels, Places
+from device.recon.model.spots import find_spots
 from device.values import Calibration
 
 SPAN_DPT = 10.5  # the eyes that are served, +-10 dpt, and the error of the first estimate
@@ -440,6 +441,9 @@ class RefractionEstimator:
         Spectrum
             OTF, complex64 (rows, cols//2 + 1).
         """
+        spots = find_spots(self._calibration.psfs[self._index], self.geometry)
+        if spots is not None:
+            return otf(spots.of_eye(eye, self._calibration.field_deg or 0.0), model.grid)
         return picture_otf(self._edges.likelihood.interpolated_otf, model, transform(self.geometry, *eye))
 
 
