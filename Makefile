@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace stress-ng lint release bench bench-archive bench-attacks bench-budget bench-data bench-deadline bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace stress-ng lint release bench bench-archive bench-attacks bench-budget bench-data bench-deadline bench-frames bench-kills bench-lesions bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -285,6 +285,10 @@ bench-pi: .venv/ready ## Print the factor of this board over the reference: one 
 
 bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
 	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
+
+EYES ?= 20
+bench-lesions: .venv/ready ## Print how many drawn lesions of each kind and size are found at one false grain a picture, for each head and 1, 4 and 8 frames; EYES=20.
+	@$(BIN)/python -m tests.bench.lesions --eyes $(EYES)
 
 bench-store: .venv/ready ## End the instrument 200 times and damage its store: what is lost; time from start to a press.
 	@$(BIN)/python -m tests.bench.store
