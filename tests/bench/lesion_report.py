@@ -1,7 +1,8 @@
 """Table and plot of the lesions' bench: sensitivity against false grains a picture, with sampling errors.
 
 The rate of false grains is that of a whole lit field: their number over the searched share of the field. The sampling
-error is the standard deviation over bootstrap samples of the eyes, in each of which the threshold is chosen anew.
+error is the larger of two standard deviations: over bootstrap samples of the eyes, in each of which the threshold is
+chosen again, and of a share of so many lesions (Jeffreys), which is not 0 where all or none were found.
 """
 
 import json
@@ -63,10 +64,12 @@ class Found:
         return float(np.mean(np.concatenate([self.lesions[k] for k in indices]) > threshold))
 
     def error(self, false_a_picture: float) -> float:
-        """Return the standard deviation of the sensitivity over bootstrap samples of the eyes."""
+        """Return the sampling error of the sensitivity, a standard deviation."""
         rng, count = np.random.default_rng(0), len(self.lesions)
         samples = [self.sensitivity(false_a_picture, rng.integers(count, size=count)) for _ in range(SAMPLES)]
-        return float(np.std(samples))
+        lesions = sum(one.size for one in self.lesions)
+        share = (self.sensitivity(false_a_picture) * lesions + 0.5) / (lesions + 1)
+        return max(float(np.std(samples)), (share * (1 - share) / (lesions + 2)) ** 0.5)
 
 
 def read(folder: Path, head: str) -> dict[str, Eyes]:

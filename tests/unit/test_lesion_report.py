@@ -45,6 +45,12 @@ def test_the_sampling_error_is_that_of_independent_eyes() -> None:
     assert found.error(1) == pytest.approx(expected, rel=0.35)
 
 
+def test_the_sampling_error_of_lesions_that_were_all_found_is_not_zero() -> None:
+    found = Found.of([figures(np.random.default_rng(0), 1.0)], KIND)
+    assert found.sensitivity(1) == 1
+    assert 0.03 < found.error(1) < 1 / KIND.count
+
+
 def test_no_lesion_is_found_in_a_refused_frame() -> None:
     rng = np.random.default_rng(0)
     assert Found.of([figures(rng, 1.0), {"refused": "too dark"}], KIND).sensitivity(1) == pytest.approx(0.5)
@@ -54,8 +60,8 @@ def test_table_and_plot_have_every_head_and_way_that_was_measured(tmp_path: Path
     rng = np.random.default_rng(0)
     (tmp_path / "imx296-100.json").write_text(json.dumps({"1": figures(rng, 1.0), "4 second-order": figures(rng, 0)}))
     lines = table(tmp_path).splitlines()
-    assert lines[2].startswith("| diffuser | 1 frame | 1 | 1.00 ± 0.00")
-    assert lines[3].startswith("| diffuser | 4 frames, second-order | 1 | 0.00 ± 0.00")
+    assert lines[2].startswith("| diffuser | 1 frame | 1 | 1.00 ± 0.05")
+    assert lines[3].startswith("| diffuser | 4 frames, second-order | 1 | 0.00 ± 0.05")
     write_report(tmp_path)
     assert in_words("1") in (tmp_path / "lesions.svg").read_text(encoding="utf-8")
 
