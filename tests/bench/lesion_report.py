@@ -124,11 +124,11 @@ def plot_of(folder: Path, kind: Kind) -> Plot:
                 Mark(rate, found.sensitivity(rate), tooltip=f"{words}, {in_words(way)}: {found.sensitivity(rate):.2f}")
                 for rate in DRAWN
             )
-            series.append(Series(f"{words}, {in_words(way)}", (marks,), number, hollow))
+            series.append(Series(words, (marks,), number, hollow, named=not hollow))
     ticks = tuple((share, f"{share:g}") for share in (0, 0.2, 0.4, 0.6, 0.8, 1))
     return Plot(
         title=f"Sensitivity against false grains: {kind.name}",
-        subtitle="drawn eyes at the light of a human eye, contrast 0.2, default solver, the same matched filter",
+        subtitle="contrast 0.2, default solver, light of a human eye; full marks: four frames, hollow: one",
         description="",
         x=log_axis(DRAWN, "false grains a picture of the whole lit field", lambda value: f"{value:g}"),
         y=Axis(-0.03, 1.03, "share of the lesions found", ticks),
