@@ -128,7 +128,7 @@ def plot_of(folder: Path, kind: Kind) -> Plot:
     ticks = tuple((share, f"{share:g}") for share in (0, 0.2, 0.4, 0.6, 0.8, 1))
     return Plot(
         title=f"Sensitivity against false grains: {kind.name}",
-        subtitle="contrast 0.2, default solver, light of a human eye; full marks: four frames, hollow: one",
+        subtitle="simulated; contrast 0.2, default solver, light of a human eye; full marks: four frames, hollow: one",
         description="",
         x=log_axis(DRAWN, "false grains a picture of the whole lit field", lambda value: f"{value:g}"),
         y=Axis(-0.03, 1.03, "share of the lesions found", ticks),
