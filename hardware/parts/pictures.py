@@ -14,6 +14,7 @@ from device.optics.ray_trace import Surface
 from device.optics.traced_relay import traced_relay
 from hardware.parts import assembly, bought
 from hardware.parts.dimensions import Dimensions
+from hardware.parts.lens_drawing import lenslets
 from hardware.parts.sheet import MEASURE, Sheet, labels
 from hardware.parts.view import Drawn, Offset, View, cut
 from services.plot import line, text
@@ -300,5 +301,6 @@ PICTURES: dict[str, Callable[[Dimensions], str]] = {
     "chart-eye": chart_eye,
     "printed": printed,
     "step-relay": relay,
+    "lenslets": lenslets,
     **{f"step-{name}": partial(step, name) for name in STEPS},
 }

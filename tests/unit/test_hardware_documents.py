@@ -27,7 +27,7 @@ from tests.project_files import ROOT, text
 from tests.test_project_files import code_in, unknown_words
 
 HARDWARE = ROOT / "hardware"
-PAPERS = ("hardware/wiring.md", "hardware/assembly.md", "hardware/model-eye.md")
+PAPERS = ("hardware/wiring.md", "hardware/assembly.md", "hardware/model-eye.md", "hardware/lenslets.md")
 RING = "hardware/decisions/0005-ring-of-10-mm.md"
 HEADS = sorted((HARDWARE / "heads").glob("*.toml"))
 HEADER: dict[int, str] = {  # pins of the 40-pin header of a Raspberry Pi
