@@ -172,12 +172,19 @@ class SensorFlaws(Table):
 
 
 class ElementFlaws(Table):
-    """Flaws of lenslets at the iris (OPTICS.md 2.9): as made, which a calibration sees, and moved since then."""
+    """Flaws of lenslets at the iris (OPTICS.md 2.9): as made, which a calibration sees, and changes since then."""
 
     focal_spread: float = Field(default=0.0, ge=0, le=0.3)  # standard deviation of the focal lengths, relative
     surface_waves: float = Field(default=0.0, ge=0, le=1)  # rms wavefront error of each lens, wavelengths
     centre_um: float = Field(default=0.0, ge=0, le=50)  # standard deviation of the centres along each axis
     moved_um: float = Field(default=0.0, ge=0, le=50)  # of the centres since the calibration
+    dust_grains: int = Field(default=0, ge=0, le=100)  # opaque, on the lenses since the calibration
+    dust_um: float = Field(default=150.0, gt=0, le=2000)  # diameter of a grain
+
+    @property
+    def since(self) -> dict[str, float]:
+        """Values of the keys that state changes since the calibration."""
+        return self.model_dump(include={"moved_um", "dust_grains", "dust_um"})
 
 
 class CalibrationSpec(Table):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from device.config.element import ElementSpec, half_widths_um
+from device.config.element import ElementSpec, half_widths_um, iris_places_um
 from device.config.head_file import OpticsSpec
 from device.config.scene import ElementFlaws
 from device.optics.diffuser import EMMETROPIA, Beam, Grid, Refraction, onto_pixels, spectral_lines_um
@@ -103,6 +103,8 @@ def spots(
     """
     element = with_flaws(optics.element, flaws, seed)
     halves_um = half_widths_um(element.lenses, optics.iris_um)
+    places_um, _ = iris_places_um(optics.iris_um)
+    grains_um = np.random.default_rng((seed, 73)).choice(places_um, flaws.dust_grains)
     size = 2 * math.ceil(reach_um(optics) / pitch_um) + 1
     psf, iris_um2 = np.zeros((size, size)), 0.0
     has_clear_gaps = element.aperture_um is not None and element.gaps == "clear"
@@ -114,6 +116,8 @@ def spots(
                 cell = _cell(lens, samples)
                 iris_um2 += 0.0 if is_gap else float(cell.sum()) * samples.dx_um**2
                 cell *= _stops(lens, samples, beam)
+                for right_um, down_um in grains_um - lens.centre_um:
+                    cell *= 1 - samples.disc(right_um, down_um, flaws.dust_um / 2)
                 waves = _quadratic(lens.curvature_per_um, samples.x_um) / (2 * wavelength_um)
                 if flaws.surface_waves and not is_gap:
                     waves += flaws.surface_waves * _surface(samples, cell, np.random.default_rng((seed, 71, number)))

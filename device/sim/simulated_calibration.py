@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from device.config.scene import ElementFlaws
 from device.optics import lenslets
 from device.optics.diffuser import Refraction, steepest_rad
 from device.optics.eye import correction_dpt
@@ -70,7 +71,7 @@ def calibration_point(world: World, moved_mm: float = 0.0, colour: Colour | None
     eye_mm = world.scene.sim.eye.focal_length_um / 1000
     point_setup = OpticalSetup(setup.scene, setup.subject, setup.sensor, lines=setup.lines)
     longer_dpt = -correction_dpt(eye_mm + moved_mm, eye_mm)
-    flaws = setup.lenses.flaws.model_copy(update={"moved_um": 0.0})
+    flaws = setup.lenses.flaws.model_copy(update=ElementFlaws().since)
     point_setup.lenses = lenslets.LensState(flaws, setup.lenses.curved)
     point_setup.refraction = Refraction(spec.m_dpt + longer_dpt, spec.j0_dpt, spec.j45_dpt)
     if spec.diffuser_to_sensor_um is not None:

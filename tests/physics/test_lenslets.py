@@ -147,6 +147,17 @@ def test_a_beam_and_black_gaps_take_their_share_and_clear_gaps_none() -> None:
     assert (clear - black).max() < 0.05 * black.max(), "the light of the gaps is spread"
 
 
+def test_grains_of_dust_stop_the_light_of_their_area_and_diffract_as_much() -> None:
+    """Babinet's principle: small grains spread as much light as they stop, most of it beside the spot."""
+    one = optics(ONE, 1200.0)
+    clean, dusty = (spots(one, 3.45, 1, lines=1, flaws=ElementFlaws(dust_grains=n, dust_um=40.0)) for n in (0, 20))
+    stopped = 1 - dusty.sum(dtype=np.float64)
+    assert stopped == pytest.approx(20 * (40 / 1200) ** 2, rel=0.1)
+    rows, cols = np.indices(clean.shape) - len(clean) // 2
+    beside = np.hypot(rows, cols) * 3.45 > 20
+    assert 0.5 * stopped < (dusty - clean)[beside].sum() < stopped
+
+
 def test_curved_lenses_focus_the_edge_of_the_field_before_the_sensor() -> None:
     """OPTICS.md 2.9: the lens is as much stronger as an eye of that sphere and cylinder; its spot does not move."""
     slope, index = (0.15, 0.2), 1.5

@@ -34,15 +34,15 @@ def test_behind_lenslets_nothing_that_is_present_is_skipped() -> None:
     assert all(plain[name].eta == 0 for name in ("lens_curvature", "lens_flaws", "lens_shift"))
 
 
-def test_shifted_lenses_are_in_the_frame_and_not_in_the_calibration() -> None:
+def test_shifted_and_dusty_lenses_are_in_the_frame_and_not_in_the_calibration() -> None:
     head = coarse(load_head(SCENES / "human_eye_imx296_control.toml"), 2)
     points = {}
-    for key in ("centre_um", "moved_um"):
-        of = world(with_changes(head, {f"sim.element.{key}": 30.0}), without=["lens_curvature"])
+    for key, size in (("centre_um", 30.0), ("moved_um", 30.0), ("dust_grains", 3)):
+        of = world(with_changes(head, {f"sim.element.{key}": size}), without=["lens_curvature"])
         points[key] = calibration_point(of), of.psf("green")
     ideal = world(head, without=["lens_curvature"]).psf("green")
     for made, (calibrated, framed) in points.items():
-        assert np.array_equal(calibrated, ideal) == (made == "moved_um")
+        assert np.array_equal(calibrated, ideal) == (made != "centre_um")
         assert not np.array_equal(framed, ideal)
 
 

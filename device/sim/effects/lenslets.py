@@ -60,28 +60,31 @@ class LensFlaws:
 
     def apply(self, setup: OpticalSetup) -> None:
         """Make the lenses of frames and calibration with these flaws, drawn from the scene's seed."""
-        moved_um = setup.lenses.flaws.moved_um
-        setup.lenses = setup.lenses._replace(flaws=setup.scene.sim.element.model_copy(update={"moved_um": moved_um}))
+        made = setup.scene.sim.element.model_copy(update=setup.lenses.flaws.since)
+        setup.lenses = setup.lenses._replace(flaws=made)
 
 
 class LensShift:
-    """Shift of the lenses' centres since the calibration: the plate has crept or swollen; OPTICS.md 2.9."""
+    """Change of the lenses since the calibration: the plate has crept, or dust fell onto it; OPTICS.md 2.9."""
 
     name = "lens_shift"
 
     def size(self, scene: Scene) -> Size:
         """Return the size eta: 0 for a diffuser and lenses in their places, else 1 (not measured)."""
-        moved_um = scene.sim.element.moved_um
+        flaws = scene.sim.element
         if scene.optics.element.kind != "lenslets":
             return _no_lenses()
-        if moved_um == 0:
+        if not (flaws.moved_um or flaws.dust_grains):
             return Size(0.0, "the lenses stand as at the calibration")
-        return Size(_PRESENT, f"centres moved by {moved_um:g} um along each axis; eta not measured")
+        return Size(
+            _PRESENT,
+            f"centres moved by {flaws.moved_um:g} um along each axis, {flaws.dust_grains} grains; eta not measured",
+        )
 
     def apply(self, setup: OpticalSetup) -> None:
-        """Move the lenses of frames, not those of the calibration."""
-        moved_um = setup.scene.sim.element.moved_um
-        setup.lenses = setup.lenses._replace(flaws=setup.lenses.flaws.model_copy(update={"moved_um": moved_um}))
+        """Move and cover the lenses of frames, not those of the calibration."""
+        since = setup.scene.sim.element.since
+        setup.lenses = setup.lenses._replace(flaws=setup.lenses.flaws.model_copy(update=since))
 
 
 def _no_lenses() -> Size:
