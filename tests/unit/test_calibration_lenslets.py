@@ -107,7 +107,7 @@ def test_whole_calibration_of_lenslets_finds_them_and_what_has_become_of_them(tm
     bench.world = World(head(lenses=moved, aperture_um=520.0, gaps="clear"), VirtualClock())
     again = bench.archive.load(bench.calibrate(CalibrationJob(head(), "D-1", "a technician", "0.1.0")))
     assert dict(again.provenance.figures)["lens_moved_um"] == pytest.approx(3 / 2**0.5, rel=0.3)
-    said = " ".join(bench.messages)
-    assert "lenses without a spot of their own: 1" in said
-    assert "passes beside the lenses" in said
-    assert "have moved by" in said
+    shown = " ".join(bench.messages)
+    assert "lenses without a spot of their own: 1" in shown
+    assert "passes beside the lenses" in shown
+    assert "have moved by" in shown
