@@ -152,5 +152,6 @@ def head_toml(spec: InstrumentSpec) -> str:
     """Return the TOML text of a head file with the spec's camera and optics, light backend "sim" and seed 1."""
     assert spec.optics is not None
     camera = spec.camera.model_dump(exclude_none=True, exclude={"sensor"})
-    tables = {"camera": camera, "light": {"backend": "sim"}, "optics": spec.optics.model_dump(), "sim": {"seed": 1}}
+    optics = spec.optics.model_dump(exclude_none=True)
+    tables = {"camera": camera, "light": {"backend": "sim"}, "optics": optics, "sim": {"seed": 1}}
     return tomli_w.dumps({"name": "Head of a hard case"} | tables)
