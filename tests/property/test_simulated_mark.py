@@ -515,6 +515,7 @@ NO_PICTURES = {
     "device/calibration/signing.py _zip_archive": "copies files that state the mark",
     "device/config/image_files.py _decode_npz": "reads",
     "device/sim/photo.py _eight_bits": "resamples",
+    "hardware/parts/lens_plate.py export_plate": "height map of a part",
     "services/delivery/visit_export.py zip_archive": "copies files that state the mark",
     "services/imaging/picture_files.py to_jpeg": "resamples",
     "services/research/dataset_pairs.py _placed": "resamples",
