@@ -7,7 +7,7 @@ from statistics import median, median_low
 WINDOW = 200  # durations: the next one is longer than the second largest in one of a hundred runs
 QUANTILE = 0.99
 STALL = 8.0  # times the median: the machine was busy during one step; a steady load makes at most 5
-FORGET = 0.997  # a skip, of the quantile: half after 231, not below the median; whole again after one run
+TRIED_AFTER = 200  # skips of a step that usually fits: a trial may be late, as one in a hundred runs may
 LEAST_RUNS = 3  # fewest whose median shows no stall
 PACE_WINDOW = 11
 LEAST_S = 1e-6
@@ -45,23 +45,25 @@ class DurationEstimate:
     def __init__(self, pace: Pace) -> None:
         self._pace = pace
         self._seen: deque[float] = deque(maxlen=WINDOW)
-        self._share = 1.0  # of the quantile, after skips
+        self._skips = 0  # since the last run
 
     def add(self, seconds: float) -> None:
         """Add the duration of one run."""
         self._seen.append(seconds / self._pace.seconds)
-        self._share = 1.0
+        self._skips = 0
 
     @property
     def seconds(self) -> float:
         """Quantile of 99 %: the second largest of 200 durations, the largest of fewer; 0.0 before the first run.
 
-        Less after skips, but at least the median.
+        The median after 200 skips, until the next run.
         """
         if not self._seen:
             return 0.0
         rank = min(ceil(QUANTILE * (len(self._seen) + 1)), len(self._seen))
-        return max(self._share * self._pace.seconds * sorted(self._seen)[rank - 1], self.typical_s)
+        if self._skips >= TRIED_AFTER:
+            return self.typical_s
+        return self._pace.seconds * sorted(self._seen)[rank - 1]
 
     @property
     def typical_s(self) -> float:
@@ -75,9 +77,8 @@ class DurationEstimate:
     def skipped(self, usually_fits: bool) -> None:
         """Reduce the estimate after the step was skipped for want of time: it records no duration.
 
-        One or two durations are halved, and a stall is forgotten. Of more durations the quantile shrinks by 0.3 % where
-        the step usually fits, until one run, so that it is tried once; where it does not, the time is too short and
-        nothing is wrong.
+        One or two durations are halved. Of more, a skip forgets one stall; after 200 skips of a step that usually fits
+        the median is the estimate, so that it is tried once. Where it usually does not fit, the time is too short.
 
         Parameters
         ----------
@@ -89,7 +90,7 @@ class DurationEstimate:
         elif (largest := max(self._seen)) > STALL * median_low(self._seen):
             self._seen.remove(largest)
         elif usually_fits:
-            self._share *= FORGET
+            self._skips += 1
 
 
 class RefractionCosts:
