@@ -47,13 +47,13 @@ def cells(plate: LensPlate) -> Iterator[CrossSection]:
 
 
 def _notes(plate: LensPlate) -> list[str]:
-    said = (
+    lines = (
         f"Equal spherical caps, R {plate.radius_mm:.3f} mm for n = {plate.index:g} at 0.55 um (f {plate.focal_mm:.3f} "
         f"mm in air; another n: R = (n - 1) f), their vertices {1000 * plate.vertex_mm:.0f} um above the rim.",
         f"Lenses towards the eye, on the iris (dashed, {plate.iris_mm:g} mm); vertices {plate.distance_mm:g} mm before "
         "the sensor, in air. All in mm; a mould is the mirror image, -x.",
     )
-    return [text(24, 54 + 18 * row, words, "quiet small") for row, words in enumerate(said)]
+    return [text(24, 54 + 18 * row, words, "quiet small") for row, words in enumerate(lines)]
 
 
 def _plan(plate: LensPlate) -> list[str]:
