@@ -116,15 +116,16 @@ def check_single_journal(machine: Machine, journal: Path, identity: dict[str, by
 
 def test_networkmanager_and_avahi_accept_their_configuration(board: Board) -> None:
     with board.boots() as machine:
-        wifi = board.identity()["wifi"].decode()
         machine.until(lambda: machine.show("NetworkManager.service", "ActiveState") == ["active"])
+        wifi = board.identity()["wifi"].decode()
         radio, security = "802-11-wireless", "802-11-wireless-security"
         fields = f"{radio}.mode,{radio}.ssid,{security}.key-mgmt,{security}.psk,"
         fields += "connection.autoconnect,ipv4.method,ipv4.addresses"
         asked = ["nmcli", "--terse", "--show-secrets", "--get-values", fields, "connection", "show", "access-point"]
-        found = machine.run(*asked).split()
         name = machine.run("hostname").strip()
-        assert sorted(found) == sorted(["no", "ap", name, "wpa-psk", wifi, "shared", "10.42.0.1/24"])
+        expected = sorted(["no", "ap", name, "wpa-psk", wifi, "shared", "10.42.0.1/24"])
+        # NetworkManager answers on the bus before it gives secrets away.
+        machine.until(lambda: sorted(machine.run(*asked, check=False).split()) == expected)
         assert "keyfile" not in machine.run("journalctl", "-u", "NetworkManager", "-p", "warning", "-o", "cat")
         machine.run("systemctl", "start", "avahi-daemon.service")
         machine.until(lambda: "Server startup complete" in machine.run("journalctl", "-u", "avahi-daemon", "-o", "cat"))
