@@ -291,7 +291,7 @@ def test_pictures_of_the_documents() -> None:
         check(ROOT / "hardware/pictures" / name, True)
     for path in (SHIPPED / "frontier.svg", ROOT / "hardware/pictures/frontier-eye.svg"):
         drawing = path.read_text()
-        # The truth and one picture for each choice that the machine's speed told apart.
+        # The truth and one picture for each different choice of the time budgets.
         assert drawing.count("<image") > 1
         check_embedded(drawing, True, drawing.count("<image"))
 
