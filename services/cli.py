@@ -37,6 +37,7 @@ GROUPS = {
     "snapshots": "services.records.command",
     "store": "services.backup.command",
     "archive": "services.archive.command",
+    "programme": "services.records.programme_command",
 }
 
 
@@ -100,7 +101,7 @@ def run(
     host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
-    protocol: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
+    programme: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
     name: Annotated[list[str] | None, typer.Option(help="A name of this computer in the network.")] = None,
     updates: Annotated[
         Path | None, typer.Option(help="The updater's folder, for the page to show.", readable=False)
@@ -114,11 +115,11 @@ def run(
     from services.delivery.uploader import HttpsUploader, load_settings
     from services.http.server import base_url, bind_socket, inherited_socket, serve  # web stack: this command only
     from services.instrument.watchdog import Watchdog
-    from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
+    from services.records.programme import DEFAULT_PROGRAMME, load_programme
     from services.research.frontier import measure_scene
 
     spec = _chosen(head, replay, tuple(raw or ()), tuple(psf or ()))
-    plan = load_protocol(protocol or DEFAULT_PROTOCOL)
+    plan = load_programme(programme or DEFAULT_PROGRAMME)
     uploader = HttpsUploader(load_settings(send)) if send is not None else None
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
     address = inherited_socket(os.environ) or bind_socket(host, port)

@@ -27,7 +27,7 @@ from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue, UploadReceipt
 from services.records.visit_document import visit_document
@@ -62,7 +62,7 @@ def filled_store(folder: Path, *, with_log: bool) -> Path:
     """
     keys, clock, original = (f"{number:016x}" for number in count()), VirtualClock(), folder / "original"
     with CaptureStore(original, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         light = DoseLedgerStore(store.engine, clock, WINDOW_S, "boot")
         for number in range(VISITS):
             visit = people.begin(next(keys)).id
@@ -103,7 +103,7 @@ def shown(folder: Path, with_settings: bool = False) -> tuple[Shown, int]:
     """
     clock = VirtualClock(elapsed_s=100.0)
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         light = DoseLedgerStore(store.engine, clock, WINDOW_S, "boot")
         journal = CaptureJournal(store).interrupted
         queue = UploadQueue(store.engine, clock)

@@ -3,7 +3,7 @@
 
 import { actions } from "./core/actions.js";
 import { showAim } from "./core/aiming.js";
-import { EventStream, getCapture, getProtocol, releaseControl } from "./core/api.js";
+import { EventStream, getCapture, getProgramme, releaseControl } from "./core/api.js";
 import { page } from "./screens/page_layout.js";
 import { goOnWhenShown, stay } from "./core/going_on.js";
 import { bindKeys } from "./core/keyboard.js";
@@ -162,7 +162,7 @@ const eventHandlers = {
 
 async function refresh() {
   await refreshStatus();
-  if (!get().protocol) set({ protocol: (await alertOnError(getProtocol)) ?? null });
+  if (!get().programme) set({ programme: (await alertOnError(getProgramme)) ?? null });
   await flushUnsaved();
   await loadRoute(get().route);
 }

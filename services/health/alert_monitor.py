@@ -101,7 +101,7 @@ class AlertMonitor:
 
     def _of_space(self) -> Iterator[Alert]:
         store = self._sources.store
-        slots = self._sources.visits.protocol.slots
+        slots = self._sources.visits.programme.slots
         if isinstance(store.refusal, StoreReadOnly):  # the problem of the next live picture says so
             return iter(())
         return alerts.space_alerts(store.space.captures_left(), store.space.visits_left(len(slots)))

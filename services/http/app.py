@@ -39,7 +39,7 @@ from services.instrument.head_arbiter import HeadArbiter
 from services.instrument.pending_captures import PendingCaptures
 from services.instrument.status import read_status
 from services.instrument.visit_montage import MontageMaker
-from services.records.protocol import Protocol, load_protocol
+from services.records.programme import Programme, load_programme
 from services.records.upload_queue import UploadQueue
 from services.records.visit_repository import VisitRepository
 
@@ -61,7 +61,7 @@ class Application:
 def create_app(
     arbiter: HeadArbiter,
     authenticator: PinAuthenticator,
-    protocol: Protocol | None = None,
+    programme: Programme | None = None,
     host_names: tuple[str, ...] | None = None,
     usb_drives: UsbDrives | None = None,
     technician_routers: Sequence[APIRouter] = (),
@@ -72,13 +72,13 @@ def create_app(
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
     `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
-    name of this computer. `protocol` None loads the default programme. `technician_routers` are routers that require
+    name of this computer. `programme` None loads the default programme. `technician_routers` are routers that require
     the technician's login. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
     """
     store = arbiter.context.store
     clock = arbiter.context.clock
-    visits = VisitRepository(store.engine, protocol or load_protocol(), clock)
+    visits = VisitRepository(store.engine, programme or load_programme(), clock)
     lease = ControlLease(clock)
     queue = UploadQueue(store.engine, clock)
     pack = archive_builder(store, visits)

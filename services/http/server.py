@@ -49,7 +49,7 @@ from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import Protocol
+from services.records.programme import Programme
 from services.records.read_only_store import opened_store
 from services.records.visit_repository import VisitRepository
 
@@ -109,7 +109,7 @@ def serve(
     data: Path,
     ready: Callable[[], None],
     watchdog: Watchdog,
-    protocol: Protocol,
+    programme: Programme,
     measure: Measure,
     host_names: tuple[str, ...] = (),
     updater: tuple[Path | None, Path | None] = (None, None),
@@ -126,14 +126,14 @@ def serve(
     clock = SystemClock()
     with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
         data = store.folder  # of a read-only store: its copy in memory
-        protocol = _with_own_numbers(protocol, store)
+        programme = _with_own_numbers(programme, store)
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_path(spec, data))
         event_log = undo.enter_context(closing(EventLog(data / "event-log")))
         context = AppContext(spec, archive, store, EventBus(), clock, watchdog, stop.failed)
         explorer = AccuracyExplorer(data / "accuracy", data / "plans", clock, spec, context.event_bus.publish, measure)
 
-        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, protocol)
+        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, programme)
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
         undo.callback(arbiter.close)
         authenticator = PinAuthenticator(data / "technician.json", clock)
@@ -145,7 +145,7 @@ def serve(
             backup_routes(backups, store, UsbDrives(), clock),
         ]
         names = own_host_names() + host_names
-        app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)
+        app = create_app(arbiter, authenticator, programme, names, technician_routers=routers, uploader=uploader)
         _log_start(app.http.version, store)
         ready()
         stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
@@ -153,13 +153,13 @@ def serve(
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
 
 
-def _with_own_numbers(protocol: Protocol, store: CaptureStore) -> Protocol:
-    """Return the protocol with the numbers of this device, whose identity is created at the first start.
+def _with_own_numbers(programme: Programme, store: CaptureStore) -> Programme:
+    """Return the programme with the numbers of this device, whose identity is created at the first start.
 
-    A disk that is read-only and has no identity leaves the protocol as it is: it takes no pictures.
+    A disk that is read-only and has no identity leaves the programme as it is: it takes no pictures.
     """
     device = load_or_create_device(store.folder) if store.refusal is None else read_device(store.folder)
-    return protocol if device is None else protocol.for_device(device.prefix)
+    return programme if device is None else programme.for_device(device.prefix)
 
 
 def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus) -> "Server":
@@ -174,10 +174,10 @@ def _log_start(version: str, store: CaptureStore) -> None:
 
 
 def _open_exam(
-    context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer, protocol: Protocol
+    context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer, programme: Programme
 ) -> ExamService:
-    """Open the head with the calibration in force, and return its exam; `protocol` has the slots of its captures."""
-    pictures = VisitRepository(context.store.engine, protocol, context.clock).pictures
+    """Open the head with the calibration in force, and return its exam; `programme` has the slots of its captures."""
+    pictures = VisitRepository(context.store.engine, programme, context.clock).pictures
     head = open_head(with_calibration(context.spec, context.archive.root), context.clock, doses)
     return ExamService(
         head,

@@ -71,7 +71,7 @@ class CardBoot:
         if settings.head is not None:
             arguments["HEAD"] = str(_from_root(head_path(settings.head, output, self._release), self.root))
         if settings.programme is not None:
-            arguments["PROGRAMME"] = f"--protocol {_from_root(output / settings.programme, self.root)}"
+            arguments["PROGRAMME"] = f"--programme {_from_root(output / settings.programme, self.root)}"
         content = "".join(f"{name}={value}\n" for name, value in arguments.items())
         self._write_public("instrument.env", content.encode())
 

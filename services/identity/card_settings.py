@@ -18,7 +18,7 @@ from device.config.head_file import load_head
 from device.config.toml_file import Table, load_toml
 from device.errors import DiffuscopeError, SpecError
 from device.user_files import files_in, read_text
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 
 FILE = "diffuscope.toml"
 UPDATES = "update.toml"  # of the update server, put onto the data partition by SSH
@@ -150,7 +150,7 @@ def _files_beside(settings: CardSettings, boot: Path, release: Path, zones: Path
     if settings.country is not None and f"\n{settings.country}\t" not in (zones / COUNTRIES).read_text("utf-8"):
         raise SpecError(f"{FILE}: country: {settings.country!r} is none", "Write one such as KE; Great Britain is GB.")
     if settings.programme is not None:
-        load_protocol(boot / settings.programme)
+        load_programme(boot / settings.programme)
     if settings.head is not None:
         path = head_path(settings.head, boot, release)
         if not path.is_file():

@@ -20,7 +20,7 @@ from services.instrument.background import run_in_subprocess
 from services.lru_cache import LruCache
 from services.records.capture import NO_METHOD
 from services.records.capture_store import CaptureStore
-from services.records.protocol import Protocol
+from services.records.programme import Programme
 from services.records.visit import Visit
 
 log = logging.getLogger(__name__)
@@ -84,12 +84,12 @@ class MontageMaker:
         self._kept = LruCache[str, JoinedPictures | DiffuscopeError](MAX_KEPT)
         self._is_busy = self._is_closed = False
 
-    def montage(self, visit: Visit, protocol: Protocol, eye: Eye) -> VisitMontage:
+    def montage(self, visit: Visit, programme: Programme, eye: Eye) -> VisitMontage:
         """Return the montage of the chosen pictures of an eye as far as it is known, and request it if it is not.
 
         Errors: StoreDamaged, RecordNotFound for a chosen picture whose record cannot be read.
         """
-        pictures = self._pictures(visit, protocol, eye)
+        pictures = self._pictures(visit, programme, eye)
         digest = hashlib.sha256(" ".join(picture.digest for picture in pictures).encode()).hexdigest()
         if len(pictures) < 2:
             return VisitMontage(pictures, digest, "none")
@@ -110,10 +110,10 @@ class MontageMaker:
             self._lock.notify_all()
             self._lock.wait_for(lambda: not self._is_busy, timeout=5)
 
-    def _pictures(self, visit: Visit, protocol: Protocol, eye: Eye) -> tuple[VisitPicture, ...]:
+    def _pictures(self, visit: Visit, programme: Programme, eye: Eye) -> tuple[VisitPicture, ...]:
         """Return the chosen reconstructed pictures of an eye, in the order of the programme."""
         found = []
-        for slot in protocol.slots:
+        for slot in programme.slots:
             chosen = visit.slots[slot.id].chosen if slot.eye == eye and slot.id in visit.slots else None
             if chosen is None:
                 continue

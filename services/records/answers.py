@@ -5,7 +5,7 @@ from datetime import datetime, time
 
 from device.errors import InputError
 from services.records.json_values import FormValue
-from services.records.protocol import VISIONS
+from services.records.programme import VISIONS
 
 Validator = Callable[[object], FormValue]
 COMPLAINTS = ("sudden_loss", "flashes", "pain", "red", "none")

@@ -12,7 +12,7 @@ from services.errors import RecordNotFound
 from services.records import row_validation, schema
 from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
 from services.records.dose_ledger_tables import add_given_dose
-from services.records.protocol import CHOOSE_REMEDY, Protocol, Slot
+from services.records.programme import CHOOSE_REMEDY, Programme, Slot
 from services.records.schema import CaptureRow, CaptureSlotRow, VisitRow, json_extract_or_null
 
 SEARCHED_CAPTURES = 8  # number of newest captures that are searched: more than a visit has
@@ -78,13 +78,13 @@ def requested_target(session: Session, capture: str) -> tuple[str, str | None, s
     return row.eye, report.visit, report.slot
 
 
-def slot_of_same_field(protocol: Protocol, slot: str, eye: Eye) -> Slot:
+def slot_of_same_field(programme: Programme, slot: str, eye: Eye) -> Slot:
     """Return the first slot of that eye with the same field of view as `slot`.
 
-    InputError if the protocol has none, RecordNotFound if `slot` is unknown.
+    InputError if the programme has none, RecordNotFound if `slot` is unknown.
     """
-    field = protocol.slot(slot).field
-    for candidate in protocol.slots:
+    field = programme.slot(slot).field
+    for candidate in programme.slots:
         if (candidate.eye, candidate.field) == (eye, field):
             return candidate
     raise InputError(f"eye: the programme has no picture of the {field} of {eye}", CHOOSE_REMEDY)

@@ -8,7 +8,7 @@ from typing import Literal, cast
 from device.values import ChannelUse, Eye
 from services.records.capture import NO_METHOD, StoredVerdict
 from services.records.json_values import FormValue
-from services.records.protocol import VISIONS, Protocol, Vision
+from services.records.programme import VISIONS, Programme, Vision
 
 GREEN_ONLY = "colour.none"  # no other colour was asked for, or the head has none
 EYE_WORDS = {"OD": "right", "OS": "left"}
@@ -92,7 +92,7 @@ class Visit:
 
     @property
     def next_slot(self) -> str | None:
-        """Return the id of the first empty slot in the order of the protocol; None if there is none."""
+        """Return the id of the first empty slot in the order of the programme; None if there is none."""
         return next((id for id, slot in self.slots.items() if slot.state == "empty"), None)
 
     @property
@@ -133,7 +133,7 @@ def decision_after(slot: SlotState, new: SlotCapture) -> SlotDecision | None:
     return None if new.is_good and not (chosen and chosen.is_good) else before
 
 
-def decide_outcome(protocol: Protocol, fields: Mapping[str, FormValue], slots: Mapping[str, SlotState]) -> Outcome:
+def decide_outcome(programme: Programme, fields: Mapping[str, FormValue], slots: Mapping[str, SlotState]) -> Outcome:
     """Return the outcome of a visit by the rules of the programme: the first that applies, most urgent first.
 
     Order: urgent complaint (`refer_today`), vision below the programme's limit (`refer_vision`), no consent to pictures
@@ -145,7 +145,7 @@ def decide_outcome(protocol: Protocol, fields: Mapping[str, FormValue], slots: M
     urgent = [words for complaint, words in URGENT_COMPLAINTS.items() if complaint in named]
     if urgent:
         return Outcome("refer_today", f"See the doctor today: {' and '.join(urgent)}.")
-    limit = protocol.programme.vision_limit
+    limit = programme.referral.vision_limit
     low_vision = [eye for eye in EYE_WORDS if _is_below(fields.get(f"vision_{eye.lower()}"), limit)]
     if low_vision:
         return Outcome("refer_vision", f"Refer: vision of {_eyes(low_vision)} below {limit}.")
@@ -153,9 +153,9 @@ def decide_outcome(protocol: Protocol, fields: Mapping[str, FormValue], slots: M
         taken = any(slot.captures for slot in slots.values())
         kept = " to more. Those taken before are kept." if taken else " to pictures. None were taken."
         return Outcome("declined", f"The patient did not agree{kept}")
-    if missing_phrases := _missing_pictures(protocol, slots):
+    if missing_phrases := _missing_pictures(programme, slots):
         return Outcome("refer_picture", f"Refer: {'; '.join(missing_phrases)}.")
-    empty = sum(slot.required and slots[slot.id].state == "empty" for slot in protocol.slots)
+    empty = sum(slot.required and slots[slot.id].state == "empty" for slot in programme.slots)
     missing = f", {empty} not taken" if empty else ""
     return Outcome("send", f"The pictures are kept{missing}. They are for an eye specialist.")
 
@@ -164,18 +164,18 @@ def _is_below(vision: FormValue, limit: Vision) -> bool:
     return vision is not None and VISIONS.index(cast(Vision, vision)) > VISIONS.index(limit)
 
 
-def _missing_pictures(protocol: Protocol, slots: Mapping[str, SlotState]) -> list[str]:
+def _missing_pictures(programme: Programme, slots: Mapping[str, SlotState]) -> list[str]:
     """Return a phrase for each group of eyes without any picture, or with a required picture that was not possible.
 
     Not possible: the slot has the state `not_possible`. A required slot that is only empty adds no phrase if the eye
     has another picture.
     """
-    failed = {slot.eye for slot in protocol.slots if slot.required and slots[slot.id].state == "not_possible"}
-    seen = {slot.eye for slot in protocol.slots if slots[slot.id].state == "taken"}
+    failed = {slot.eye for slot in programme.slots if slot.required and slots[slot.id].state == "not_possible"}
+    seen = {slot.eye for slot in programme.slots if slots[slot.id].state == "taken"}
     phrases: tuple[tuple[str, list[Eye]], ...] = (
-        ("picture of {} not possible", [eye for eye in protocol.eyes if eye in failed and eye not in seen]),
-        ("not every picture of {} possible", [eye for eye in protocol.eyes if eye in failed and eye in seen]),
-        ("picture of {} not taken", [eye for eye in protocol.eyes if eye not in failed and eye not in seen]),
+        ("picture of {} not possible", [eye for eye in programme.eyes if eye in failed and eye not in seen]),
+        ("not every picture of {} possible", [eye for eye in programme.eyes if eye in failed and eye in seen]),
+        ("picture of {} not taken", [eye for eye in programme.eyes if eye not in failed and eye not in seen]),
     )
     return [words.format(_eyes(eyes)) for words, eyes in phrases if eyes]
 

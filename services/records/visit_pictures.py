@@ -14,7 +14,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import ResumableCapture
 from services.records.capture_target import CaptureTarget, Permit, RowWriter, permit_test_picture
 from services.records.idempotent_requests import IdempotentRequests, key_conflict
-from services.records.protocol import CHOOSE_REMEDY, Protocol
+from services.records.programme import CHOOSE_REMEDY, Programme
 from services.records.schema import CaptureSlotRow
 from services.records.storage_errors import storage_errors
 from services.records.visit import SlotCapture, SlotDecision, Visit, decision_after
@@ -31,12 +31,12 @@ class VisitPictures:
     def __init__(
         self,
         engine: Engine,
-        protocol: Protocol,
+        programme: Programme,
         clock: Clock,
         requests: IdempotentRequests,
         get: Callable[[str], Visit],
     ) -> None:
-        self._engine, self._protocol, self._clock, self._requests, self._get = engine, protocol, clock, requests, get
+        self._engine, self._programme, self._clock, self._requests, self._get = engine, programme, clock, requests, get
 
     def capture_target(self, eye: Eye, key: str | None, id: str | None, slot: str | None) -> CaptureTarget:
         """Return the target of a capture of that eye; without a visit `id` or a slot, the target of a test picture.
@@ -49,29 +49,29 @@ class VisitPictures:
             return CaptureTarget(
                 write_rows=self._row_writer(key),
                 request=request,
-                frames=self._protocol.frames,
-                colours=self._protocol.colours,
+                frames=self._programme.frames,
+                colours=self._programme.colours,
             )
         visit = self._get(id)
-        protocol_slot = self._protocol.slot(slot)
-        if protocol_slot.eye != eye:
-            raise InputError(f"{slot} is a picture of {protocol_slot.eye}, not of {eye}", CHOOSE_REMEDY)
+        programme_slot = self._programme.slot(slot)
+        if programme_slot.eye != eye:
+            raise InputError(f"{slot} is a picture of {programme_slot.eye}, not of {eye}", CHOOSE_REMEDY)
         if visit.finished_at is not None:
             raise VisitFinished(f"{visit.number} is finished")
         permit = self.permission(id)
         permit()
         tries = len(visit.slots[slot].captures)
-        colours = self._protocol.colours if visit.no_colour is None else ()  # light that is not shown is not given
+        colours = self._programme.colours if visit.no_colour is None else ()  # light that is not shown is not given
         return CaptureTarget(
             id,
             slot,
             tries,
-            self._protocol.retakes,
-            protocol_slot.field,
+            self._programme.retakes,
+            programme_slot.field,
             self._row_writer(key),
             request,
             permit,
-            self._protocol.frames,
+            self._programme.frames,
             colours,
         )
 
@@ -83,12 +83,12 @@ class VisitPictures:
         key = interrupted.key
         entry = interrupted.press
         request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
-        field = None if entry.slot is None else self._protocol.slot(entry.slot).field
+        field = None if entry.slot is None else self._programme.slot(entry.slot).field
         return CaptureTarget(
             entry.visit,
             entry.slot,
             entry.tries,
-            self._protocol.retakes,
+            self._programme.retakes,
             field,
             self._row_writer(key),
             request,
@@ -148,14 +148,14 @@ class VisitPictures:
 
         If the capture already has that eye, record the confirmation. `by`: public name of the screen that requested the
         correction, or None. Errors: RecordNotFound (unknown capture or test picture), VisitFinished, InputError (the
-        protocol has no such slot).
+        programme has no such slot).
         """
 
         def act(session: Session) -> str:
             shot = laterality_correction.slot_row_of(session, capture)
             row = visit_rows.unfinished_row(session, shot.visit)
-            before = visit_queries.read_visit(session, self._protocol, row).slots
-            to = laterality_correction.slot_of_same_field(self._protocol, shot.slot, eye)
+            before = visit_queries.read_visit(session, self._programme, row).slots
+            to = laterality_correction.slot_of_same_field(self._programme, shot.slot, eye)
             from_slot = shot.slot
             if to.id == from_slot:
                 laterality_correction.confirm(session, shot, self._clock.wall(), by)
@@ -194,17 +194,19 @@ class VisitPictures:
             visit_rows.decide(session, id, slot, SlotDecision(capture))
             return id
 
-        self._protocol.slot(slot)
+        self._programme.slot(slot)
         return self._run(key, f"choose {id} {slot} {capture}", act)
 
     def mark_not_possible(self, key: str, id: str, slot: str, reason: str) -> Visit:
-        """Record that a picture of this slot was not possible, with a reason of the protocol; earlier captures stay.
+        """Record that a picture of this slot was not possible, with a reason of the programme; earlier captures stay.
 
         Errors: InputError (unknown reason), RecordNotFound (unknown visit or slot), VisitFinished.
         """
-        self._protocol.slot(slot)
-        if reason not in self._protocol.reasons:
-            raise InputError(f"reason: {reason[:40]!r} is none", f"Choose one of: {', '.join(self._protocol.reasons)}.")
+        self._programme.slot(slot)
+        if reason not in self._programme.reasons:
+            raise InputError(
+                f"reason: {reason[:40]!r} is none", f"Choose one of: {', '.join(self._programme.reasons)}."
+            )
 
         def act(session: Session) -> str:
             visit_rows.unfinished_row(session, id)
@@ -237,12 +239,12 @@ class VisitPictures:
         if id is None or slot is None:
             raise SettingError(f"the report of {capture} names no visit or no slot")
         row = visit_queries.visit_row(session, id)
-        visit = visit_queries.read_visit(session, self._protocol, row)
+        visit = visit_queries.read_visit(session, self._programme, row)
         session.add(CaptureSlotRow(capture=capture, visit=id, slot=slot))
         visit_rows.decide(session, id, slot, decision_after(visit.slots[slot], SlotCapture(capture, report.verdict)))
         if row.finished_at is not None:
             session.flush()
-            visit_rows.finish(session, self._protocol, row, schema.utc_text(self._clock.wall()))
+            visit_rows.finish(session, self._programme, row, schema.utc_text(self._clock.wall()))
 
     def _run(self, key: str, request: str, act: Callable[[Session], str]) -> Visit:
         """Run a change once, in a transaction; `act` returns the id of the visit, whose present state is returned."""

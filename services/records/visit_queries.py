@@ -18,7 +18,7 @@ from device.values import ChannelUse
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import row_validation
 from services.records.capture import StoredVerdict
-from services.records.protocol import Protocol
+from services.records.programme import Programme
 from services.records.record_rows import visit_contents
 from services.records.record_signing import refuse_changed
 from services.records.row_validation import REMEDY, reading_record, without_damaged
@@ -96,7 +96,7 @@ def counts(session: Session, day: str | None) -> dict[str, int]:
     return {"done": done, "to_finish": every - done, "referred": referred, "declined": declined}
 
 
-def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) -> list[Visit]:
+def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]) -> list[Visit]:
     """Return the visits of these rows, in the same order, without those that cannot be read."""
     known = without_damaged(rows, _checked_row)
     contents = visit_contents(session, known)
@@ -113,7 +113,7 @@ def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) 
                     tuple(_taken_capture(*columns) for columns in taken[row.id, slot.id]),
                     _choice(decided, row, slot.id),
                 )
-                for slot in protocol.slots
+                for slot in programme.slots
             }
             finished_at = None if row.finished_at is None else row_validation.timestamp(row.finished_at)
             answers = {
@@ -134,15 +134,15 @@ def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) 
     return without_damaged(known, visit)
 
 
-def read_visit(session: Session, protocol: Protocol, row: VisitRow) -> Visit:
+def read_visit(session: Session, programme: Programme, row: VisitRow) -> Visit:
     """Return the visit of this row; StoreDamaged if it cannot be read."""
-    found = read_visits(session, protocol, [row])
+    found = read_visits(session, programme, [row])
     if not found:
         raise StoreDamaged(f"an entry of the visit {row.id!a} cannot be read", REMEDY)
     return found[0]
 
 
-def damaged(session: Session, protocol: Protocol) -> int:
+def damaged(session: Session, programme: Programme) -> int:
     """Return the number of visits that cannot be read."""
     many, last = 0, 0
     while True:
@@ -150,7 +150,7 @@ def damaged(session: Session, protocol: Protocol) -> int:
         rows = session.execute(query).all()
         if not rows:
             return many
-        many += len(rows) - len(read_visits(session, protocol, [row for _, row in rows if row is not None]))
+        many += len(rows) - len(read_visits(session, programme, [row for _, row in rows if row is not None]))
         last = rows[-1][0]
 
 

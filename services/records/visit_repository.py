@@ -11,7 +11,7 @@ from device.clock import Clock
 from services.errors import VisitFinished
 from services.records import answers, numbering, patient_rows, schema, visit_queries, visit_rows
 from services.records.idempotent_requests import IdempotentRequests
-from services.records.protocol import Protocol
+from services.records.programme import Programme
 from services.records.schema import AnswerRow, IdentifierRow, VisitRow
 from services.records.storage_errors import storage_errors
 from services.records.visit import Visit
@@ -26,10 +26,10 @@ class VisitRepository:
     `pictures`: the pictures of the visits; `requests`: the keys of completed requests.
     """
 
-    def __init__(self, engine: Engine, protocol: Protocol, clock: Clock) -> None:
-        self.protocol, self.clock, self._engine = protocol, clock, engine
+    def __init__(self, engine: Engine, programme: Programme, clock: Clock) -> None:
+        self.programme, self.clock, self._engine = programme, clock, engine
         self.requests = IdempotentRequests(engine, clock)
-        self.pictures = VisitPictures(engine, protocol, clock, self.requests, self.get)
+        self.pictures = VisitPictures(engine, programme, clock, self.requests, self.get)
 
     def begin(self, key: str, number: str | None = None) -> Visit:
         """Begin a visit of the patient with that number, known or new; without a number, of a new patient.
@@ -44,7 +44,7 @@ class VisitRepository:
         def act(session: Session) -> str:
             now = self.clock.wall()
             self.requests.delete_expired(session)
-            prefix = self.protocol.programme.prefix
+            prefix = self.programme.numbers.prefix
             begun_at = schema.utc_text(now)
             number_of_patient = patient_rows.patient_number(session, prefix, number, begun_at)
             id = f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
@@ -58,7 +58,7 @@ class VisitRepository:
     def get(self, id: str) -> Visit:
         """Return one visit; RecordNotFound if unknown, StoreDamaged if its rows cannot be read."""
         with storage_errors(), Session(self._engine) as session:
-            return visit_queries.read_visit(session, self.protocol, visit_queries.visit_row(session, id))
+            return visit_queries.read_visit(session, self.programme, visit_queries.visit_row(session, id))
 
     def visits(
         self, limit: int, day: str | None = None, open: bool | None = None, number: str | None = None
@@ -71,7 +71,7 @@ class VisitRepository:
         number = numbering.join_check_digit(number.upper()) if number else None
         with storage_errors(), Session(self._engine) as session:
             return visit_queries.read_visits(
-                session, self.protocol, visit_queries.find_rows(session, limit, day, open, number)
+                session, self.programme, visit_queries.find_rows(session, limit, day, open, number)
             )
 
     def damaged(self) -> int:
@@ -80,7 +80,7 @@ class VisitRepository:
         Lists omit these visits, and `get` raises StoreDamaged.
         """
         with storage_errors(), Session(self._engine) as session:
-            return visit_queries.damaged(session, self.protocol)
+            return visit_queries.damaged(session, self.programme)
 
     def counts(self, day: str | None = None) -> dict[str, int]:
         """Return the numbers of visits of a day (None: all): finished (`done`), `to_finish`, `referred`, `declined`."""
@@ -115,7 +115,7 @@ class VisitRepository:
         def act(session: Session) -> str:
             row = visit_queries.visit_row(session, id)
             if row.finished_at is None:
-                visit_rows.finish(session, self.protocol, row, schema.utc_text(self.clock.wall()))
+                visit_rows.finish(session, self.programme, row, schema.utc_text(self.clock.wall()))
             return id
 
         return self.get(self.requests.run_in_transaction(key, f"finish {id}", act))

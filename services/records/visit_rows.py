@@ -6,7 +6,7 @@ from sqlalchemy.orm import Session
 
 from services.errors import VisitFinished
 from services.records import visit_queries
-from services.records.protocol import Protocol
+from services.records.programme import Programme
 from services.records.schema import SlotDecisionRow, VisitRow
 from services.records.visit import SlotDecision, decide_outcome
 
@@ -19,10 +19,10 @@ def unfinished_row(session: Session, id: str) -> VisitRow:
     return row
 
 
-def finish(session: Session, protocol: Protocol, row: VisitRow, at: str) -> None:
+def finish(session: Session, programme: Programme, row: VisitRow, at: str) -> None:
     """Store the outcome of a visit, computed from its present answers and slots, and the time (UTC text) of its end."""
-    visit = visit_queries.read_visit(session, protocol, row)
-    ending = decide_outcome(protocol, visit.fields, visit.slots)
+    visit = visit_queries.read_visit(session, programme, row)
+    ending = decide_outcome(programme, visit.fields, visit.slots)
     row.outcome = json.dumps({"code": ending.code, "sentence": ending.sentence})
     row.finished_at = at
 

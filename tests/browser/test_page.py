@@ -41,7 +41,7 @@ def a_new_person(page: Page, complaints: Complaints) -> Page:
     """Aim at the first slot of a new patient, on a server that may be starting or whose last page has just closed."""
     complaints.expect("404")
     page.wait_for_selector("#new")
-    if page.evaluate("fetch('/api/protocol').then((answer) => answer.status)") != 200:
+    if page.evaluate("fetch('/api/programme').then((answer) => answer.status)") != 200:
         pytest.skip("this server keeps no visits")
     page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
     wait_for_release(page)

@@ -10,7 +10,7 @@ import zxingcpp
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from tests.browser.conftest import Complaints, MakeReal
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Real
@@ -296,9 +296,9 @@ def test_confirmed_eye_is_not_asked_again(open_page: Open, make_real: MakeReal) 
 
 
 def test_finished_visit_is_reopened_and_qr_code_has_no_name(open_page: Open, make_real: MakeReal) -> None:
-    programme = load_protocol()
-    phone = programme.programme.model_copy(update={"centre_phone": "+91 44 5550 0142"})
-    real = make_real(protocol=programme.model_copy(update={"programme": phone}))
+    programme = load_programme()
+    phone = programme.referral.model_copy(update={"centre_phone": "+91 44 5550 0142"})
+    real = make_real(programme=programme.model_copy(update={"referral": phone}))
     visit = real.begin_visit(consent="agreed", name="Lakshmi")
     for slot in ("R-centre", "R-nerve", "L-centre"):
         real.press(visit["id"], slot)

@@ -67,7 +67,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "run --port 0",
     "run --head {0}/head.toml --replay {0}",
     "run --head {0}/head.toml --send {0}/none.toml",
-    "run --head {0}/head.toml --protocol {0}/none.toml",
+    "run --head {0}/head.toml --programme {0}/none.toml",
     "health --at http://127.0.0.1:9",
     "health --at http://127.0.0.1:9 --json",
     "health --at nonsense",

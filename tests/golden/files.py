@@ -34,7 +34,7 @@ from services.instrument.accuracy_explorer import AccuracyExplorer
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.upload_queue import UploadQueue, UploadReceipt
 from services.records.visit_document import visit_document
 from services.records.visit_repository import VisitRepository
@@ -205,7 +205,7 @@ def _read_store(store: CaptureStore) -> dict[str, Any]:
 
 
 def _read_visits(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
-    people = VisitRepository(store.engine, load_protocol(), clock)
+    people = VisitRepository(store.engine, load_programme(), clock)
     visits = [visit_document(visit, people.undo_until(visit)).model_dump(mode="json") for visit in people.visits(50)]
     exports = {}
     for visit in people.visits(50):
@@ -300,7 +300,7 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
     export(archive.files(id), place / "sent", folder / "key")
     write_state(place, read_state(folder / "update"))
     with CaptureStore(folder / "data", reserve_bytes=0, clock=clock) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         (visit,) = (candidate for candidate in people.visits(50) if candidate.number == "B-7")
         name = folder_name(visit)
         zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)

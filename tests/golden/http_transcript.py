@@ -68,7 +68,7 @@ def visits() -> list[dict[str, Any]]:
     """Record a visit from number to outcome, the control lease, and every refusal of both."""
     with instrument() as device:
         log = Transcript(device)
-        log.ask("GET /api/protocol")
+        log.ask("GET /api/programme")
         begin = log.key()
         visit = log.ask("POST /api/visits", json=begin)
         log.ask("POST /api/visits", json=begin, note="the same key again: the same visit")

@@ -9,7 +9,7 @@ from tests.golden import compare, http_transcript
 ALWAYS = {  # public operations without input: the only refusal is that of a foreign host name
     "GET /api/status",
     "GET /api/health",
-    "GET /api/protocol",
+    "GET /api/programme",
     "GET /api/exports",
     "GET /api/upload-queue",
     "GET /api/technician",

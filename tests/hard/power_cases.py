@@ -22,7 +22,7 @@ from services.records import schema
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.recovery import rebuild_database
 from services.records.recovery_report import RecoveryReport
 from services.records.removed_captures import Removal
@@ -53,7 +53,7 @@ def capture(name: str, second: int = 0) -> Capture:
 
 
 def people(store: CaptureStore) -> VisitRepository:
-    return VisitRepository(store.engine, load_protocol(), SystemClock())
+    return VisitRepository(store.engine, load_programme(), SystemClock())
 
 
 # A case: preparation, action and judgement; `acknowledged` holds the steps that the action reported as done.

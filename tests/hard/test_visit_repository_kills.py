@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 from device.clock import SystemClock
 from services.records.capture_store import CaptureStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.visit_repository import VisitRepository
 
 ROUNDS = 6
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def repository_of(store: CaptureStore) -> VisitRepository:
-    return VisitRepository(store.engine, load_protocol(), SystemClock())
+    return VisitRepository(store.engine, load_programme(), SystemClock())
 
 
 def key(round_number: int, number: int) -> str:

@@ -42,7 +42,7 @@ from services.instrument.watchdog import Watchdog
 from services.records.capture import BUDGET_S
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import Protocol, load_protocol
+from services.records.programme import Programme, load_programme
 from services.records.visit_repository import VisitRepository
 from tests.simulated import small_head_toml
 
@@ -195,7 +195,7 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         clock: GateClock | None = None,
         carrier: Uploader | None = None,
         sticks: UsbDrives | None = None,
-        protocol: Protocol | None = None,
+        programme: Programme | None = None,
     ) -> Rig:
         clock, died = clock or GateClock(), Event()
         scene = copy(dark_world)
@@ -214,7 +214,7 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
             stack = replace(calibration, psfs=own)
         opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack, present_eye=scene.present_eye))
         event_bus = event_bus or EventBus()
-        pictures = VisitRepository(records.engine, protocol or load_protocol(), clock).pictures
+        pictures = VisitRepository(records.engine, programme or load_programme(), clock).pictures
         exam = ExamService(
             opened,
             records,
@@ -234,7 +234,7 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         )
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = PinAuthenticator(folder / "technician.json", clock)
-        build_app = partial(create_app, owner, door, protocol, uploader=carrier, usb_drives=sticks)
+        build_app = partial(create_app, owner, door, programme, uploader=carrier, usb_drives=sticks)
         clock.world = scene
         return Rig(scene, clock, records, event_bus, exam, owner, door, build_app, died)
 

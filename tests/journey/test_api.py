@@ -370,7 +370,7 @@ def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
         "/api/captures/{id}/accept": {"post"},
         "/api/captures/{id}/eye": {"post"},
         "/api/controller": {"post"},
-        "/api/protocol": {"get"},
+        "/api/programme": {"get"},
         "/api/visits": {"get", "post"},
         "/api/visits/{id}": {"get", "patch"},
         "/api/visits/{id}/not-possible": {"post"},

@@ -96,10 +96,10 @@ def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
         assert "cannot be served" in second.stderr
         assert f"--port {server.port + 1}" in second.stderr
         assert not (tmp_path / "other").exists()
-        wrong = tmp_path / "protocol.toml"
+        wrong = tmp_path / "programme.toml"
         wrong.write_text("retakes = 2\n")
-        third = diffuscope("run", "--head", served_head, "--protocol", wrong)
-        assert (third.returncode, "protocol.toml" in third.stderr) == (2, True)
+        third = diffuscope("run", "--head", served_head, "--programme", wrong)
+        assert (third.returncode, "programme.toml" in third.stderr) == (2, True)
         with ThreadPoolExecutor(1) as aside:
             pressed = aside.submit(server.ask, "POST", "/api/captures", {"eye": "OD"})
             while server.ask("GET", "/api/status")["state"] != "busy" and not pressed.done():

@@ -10,7 +10,7 @@ from device.values import Eye
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.visit_repository import VisitRepository
 from tests.journey.asking import visit_with_consent
 from tests.journey.conftest import Rig
@@ -61,7 +61,7 @@ def test_an_idempotency_key_is_bound_while_its_capture_is_in_progress(rig: Any) 
 def test_a_moved_capture_keeps_its_idempotency_key(tmp_path: Any) -> None:
     clock = VirtualClock()
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.answer("3" * 16, people.begin("1" * 16).id, "consent", "agreed").id
         keep(store, people, "c1", "OD", visit)
         people.pictures.correct_laterality("2" * 16, "c1", "OS", None)

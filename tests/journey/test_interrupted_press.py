@@ -22,7 +22,7 @@ from services.instrument.resumption import CALIBRATION_DARK, MADE_AT_START, NO_D
 from services.records import digested_json
 from services.records.capture_journal import MAX_ATTEMPTS
 from services.records.capture_target import CaptureTarget
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.visit_repository import VisitRepository
 from tests.journey.conftest import Rig, until
 from tests.journey.test_cli_server import Server
@@ -96,7 +96,7 @@ def interrupt(build: Callable[..., Rig], tmp_path: Path) -> Interrupt:
         with ExitStack() as undo:
             rig = build(tmp_path, undo, camera=lambda camera: EndsAt(camera, last))
             visit = begin_visit(rig) if of_visit else None
-            pictures = VisitRepository(rig.store.engine, load_protocol(), rig.clock).pictures
+            pictures = VisitRepository(rig.store.engine, load_programme(), rig.clock).pictures
             target = pictures.capture_target("OD", KEY, visit, "R-centre" if of_visit else None)
             with pytest.raises(DiffuscopeError, match="unexpectedly"):
                 rig.exam.press("OD", KEY, target).result(60)

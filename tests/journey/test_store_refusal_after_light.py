@@ -19,7 +19,7 @@ from services.instrument.exam_loop import LOCK_PATIENCE_S
 from services.instrument.resumption import MADE_AT_START
 from services.records import schema
 from services.records.capture_target import CaptureTarget
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.visit_repository import VisitRepository
 from tests.journey.conftest import Rig, until
 from tests.journey.test_interrupted_press import begin_visit
@@ -105,7 +105,7 @@ def locking(rig: Rig, moment: Moment) -> Iterator[OtherProgram]:
 
 
 def target(rig: Rig, visit: str) -> CaptureTarget:
-    pictures = VisitRepository(rig.store.engine, load_protocol(), rig.clock).pictures
+    pictures = VisitRepository(rig.store.engine, load_programme(), rig.clock).pictures
     return pictures.capture_target("OD", KEY, visit, "R-centre")
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 from device.ports import Camera
 from services.instrument.events import EventBus
 from services.records.capture_target import CaptureTarget
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from tests.journey.asking import visit_with_consent
 from tests.journey.conftest import GateClock, MakeRig, Rig
 from tests.red_light import FailsInRed
@@ -95,7 +95,7 @@ def test_one_picture_without_colour_shows_its_visit_in_green_and_takes_no_more_r
 
 
 def test_a_programme_of_one_colour_has_its_reason(make_rig: MakeRig) -> None:
-    rig = make_rig(protocol=load_protocol().model_copy(update={"colours": ()}))
+    rig = make_rig(programme=load_programme().model_copy(update={"colours": ()}))
     visit = begin(rig)
     press(rig, visit, "R-centre")
     assert why_green(rig, visit) == "colour.none"

@@ -70,7 +70,7 @@ def shoot(rig: Any, visit: Any, slot: str) -> Any:
 
 
 def test_a_complete_visit_from_number_to_outcome(old_rig: Any) -> None:
-    assert [slot["id"] for slot in old_rig.request("GET", "/api/protocol").json()["slots"]] == SLOTS
+    assert [slot["id"] for slot in old_rig.request("GET", "/api/programme").json()["slots"]] == SLOTS
     visit = begin(old_rig)
     assert visit["number"].startswith("A")
     assert visit["next_slot"] == "R-centre"

@@ -13,7 +13,7 @@ from device.errors import StoreFull
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_files import CAPTURE_RECORD as RECORD
 from services.records.visit_repository import VisitRepository
@@ -83,7 +83,7 @@ def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
             assert listed == set(kept), flipped
             assert not store.quarantine.sizes_bytes(), flipped
             adopted += len(store.recovery.adopted)
-            VisitRepository(store.engine, load_protocol(), VirtualClock()).visits(10)
+            VisitRepository(store.engine, load_programme(), VirtualClock()).visits(10)
         assert complete_captures(folder) == set(kept), flipped
         now = spent_of(folder)
         assert all(now[eye] >= spent[eye] - 1e-9 for eye in spent), flipped

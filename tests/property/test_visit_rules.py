@@ -16,11 +16,11 @@ from services.records.numbering import (
     looks_automatic,
     normalise,
 )
-from services.records.protocol import VISIONS, load_protocol
+from services.records.programme import VISIONS, load_programme
 from services.records.visit import SlotCapture, SlotDecision, SlotState, decide_outcome, decision_after
 
-PROTOCOL = load_protocol()
-LIMIT = VISIONS.index(PROTOCOL.programme.vision_limit)
+PROGRAMME = load_programme()
+LIMIT = VISIONS.index(PROGRAMME.referral.vision_limit)
 counters, prefixes = st.integers(1, 10**9), st.from_regex("[A-Z]{0,4}", fullmatch=True)
 
 
@@ -94,7 +94,7 @@ slot_states = st.lists(taken, max_size=4, unique_by=lambda shot: shot.capture).f
         ),
     )
 )
-visits = st.fixed_dictionaries({slot.id: slot_states for slot in PROTOCOL.slots})
+visits = st.fixed_dictionaries({slot.id: slot_states for slot in PROGRAMME.slots})
 fields = st.fixed_dictionaries(
     {},
     optional={
@@ -108,7 +108,7 @@ fields = st.fixed_dictionaries(
 
 @given(fields, visits)
 def test_the_outcome_follows_the_rules_in_order(answers: dict[str, Any], slots: dict[str, SlotState]) -> None:
-    result = decide_outcome(PROTOCOL, answers, slots)
+    result = decide_outcome(PROGRAMME, answers, slots)
     urgent = {"sudden_loss", "pain"} & set(answers.get("complaints") or [])
     is_low = any(VISIONS.index(answers[eye]) > LIMIT for eye in ("vision_od", "vision_os") if answers.get(eye))
     states = {id: slot.state for id, slot in slots.items()}
@@ -152,7 +152,7 @@ def test_another_picture_never_makes_a_slot_worse(slot: SlotState, new: SlotCapt
 @pytest.mark.parametrize("vision", [VISIONS[LIMIT], VISIONS[LIMIT + 1]])
 def test_vision_at_the_limit_is_not_referred(vision: str) -> None:
     good = SlotState((SlotCapture("a", None),))
-    result = decide_outcome(PROTOCOL, {"vision_os": vision}, {slot.id: good for slot in PROTOCOL.slots})
+    result = decide_outcome(PROGRAMME, {"vision_os": vision}, {slot.id: good for slot in PROGRAMME.slots})
     assert result.code == ("send" if vision == VISIONS[LIMIT] else "refer_vision")
     if result.code == "refer_vision":
         assert result.sentence == "Refer: vision of the left eye below 6/18."
@@ -178,4 +178,4 @@ def test_untaken_and_impossible_pictures_have_different_sentences(
     refused = SlotState((), SlotDecision(None, "pupil"))
     of = {"taken": SlotState((SlotCapture("a", None),)), "empty": SlotState(), "not_possible": refused}
     states = dict(zip(("R-centre", "R-nerve", "L-centre", "L-nerve"), (*right, *left), strict=True))
-    assert decide_outcome(PROTOCOL, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence
+    assert decide_outcome(PROGRAMME, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence

@@ -155,13 +155,13 @@ def test_every_example_of_the_template_is_valid(card: CardBoot) -> None:
     """The file on the card, with every mark # removed before a key or a table."""
     lines = text("systemd/image/card/diffuscope.toml").replace("AAAAC3Nza...", KEY.split()[1]).splitlines()
     plain = "\n".join(re.sub(r"^# (?=\[|\w+ = )", "", line) for line in lines)
-    shutil.copyfile(ROOT / "services/records/protocol.toml", card.root / "boot/chooser/programme.toml")
+    shutil.copyfile(ROOT / "services/records/programme.toml", card.root / "boot/chooser/programme.toml")
     write(card, plain)
     assert card.run() is None
     settings = kept_settings(card.kept)
     assert all(value is not None for value in dict(settings).values())
     arguments = (card.root / "run/diffuscope-settings/instrument.env").read_text()
-    assert "PROGRAMME=--protocol /run/diffuscope-settings/programme.toml\n" in arguments
+    assert "PROGRAMME=--programme /run/diffuscope-settings/programme.toml\n" in arguments
     assert (card.root / "run/diffuscope-settings/programme.toml").exists()
 
 
@@ -189,7 +189,7 @@ def test_files_that_the_settings_do_not_name_are_not_read(card: CardBoot) -> Non
 
 def test_what_the_settings_no_longer_name_is_forgotten(card: CardBoot) -> None:
     boot = card.root / "boot/chooser"
-    shutil.copyfile(ROOT / "services/records/protocol.toml", boot / "programme.toml")
+    shutil.copyfile(ROOT / "services/records/programme.toml", boot / "programme.toml")
     write(card, f'programme = "programme.toml"\n{GOOD}')
     assert card.run() is None
     (card.kept / "update.toml").write_text('channel = "https://updates.example.org/diffuscope"\n')
@@ -243,7 +243,7 @@ def test_a_refused_file_keeps_its_password_and_the_report_says_so(card: CardBoot
 def test_a_step_that_fails_is_reported_and_the_others_are_applied(card: CardBoot, broken: str) -> None:
     """What was in force stays: a damaged programme, a root without zones or a key that cannot be made costs itself."""
     boot = card.root / "boot/chooser"
-    shutil.copyfile(ROOT / "services/records/protocol.toml", boot / "programme.toml")
+    shutil.copyfile(ROOT / "services/records/programme.toml", boot / "programme.toml")
     file = write(card, f'programme = "programme.toml"\n{GOOD}')
     assert card.run() is None
     file.unlink()

@@ -12,7 +12,7 @@ from device.errors import LightLimit
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.upload_queue import UploadQueue
 from services.records.visit_repository import VisitRepository
 
@@ -37,7 +37,7 @@ def store(tmp_path: Path, clock: VirtualClock) -> Iterator[CaptureStore]:
 def test_lists_are_in_the_order_of_storage(
     store: CaptureStore, clock: VirtualClock, jumps: tuple[timedelta, ...]
 ) -> None:
-    keys, people = (f"{number:016x}" for number in count()), VisitRepository(store.engine, load_protocol(), clock)
+    keys, people = (f"{number:016x}" for number in count()), VisitRepository(store.engine, load_programme(), clock)
     visits, captures = list[str](), list[str]()
     for number, jump in enumerate((timedelta(), *jumps)):
         clock.start += jump

@@ -19,7 +19,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue
 from services.records.visit_document import visit_document
@@ -63,7 +63,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     keys = (f"{number:016x}" for number in count())
     with CaptureStore(folder, reserve_bytes=0) as store:
         people, light = (
-            VisitRepository(store.engine, load_protocol(), clock),
+            VisitRepository(store.engine, load_programme(), clock),
             DoseLedgerStore(store.engine, clock, 86_400.0, "boot"),
         )
         for number in range(3):
@@ -130,7 +130,7 @@ def test_a_corrupted_byte_in_any_column_breaks_no_list_no_count_and_no_start(
 
 
 def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
-    people, clock = VisitRepository(store.engine, load_protocol(), VirtualClock()), VirtualClock()
+    people, clock = VisitRepository(store.engine, load_programme(), VirtualClock()), VirtualClock()
     captures, visits = store.captures(2), people.visits(10)
     captures += store.captures(5, before=captures[-1].id)
     if change_made.startswith(
@@ -185,12 +185,12 @@ def test_a_damaged_capture_is_refused_and_counted_and_its_files_stay_readable(st
         store.get("c1")
     assert "call the technician" in raised.value.remedy.lower()
     assert store.read("c1", "raw.tiff") == b"content"
-    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+    people = VisitRepository(store.engine, load_programme(), VirtualClock())
     assert [visit.slots["R-centre"].captures[0].capture for visit in people.visits(10)] == ["c2", "c1", "c0"]
 
 
 def test_a_damaged_visit_is_refused_and_counted(store: CaptureStore) -> None:
-    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+    people = VisitRepository(store.engine, load_programme(), VirtualClock())
     newest, middle, _ = people.visits(10)
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE visits SET outcome = CAST(x'7bff' AS TEXT) WHERE id = ?", (middle.id,))

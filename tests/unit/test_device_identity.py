@@ -19,7 +19,7 @@ from services.records.capture_store import CaptureStore
 from services.records.device_identity import DeviceIdentity, board_serial_number, load_or_create_device, read_device
 from services.records.numbering import automatic_number
 from services.records.patient_rows import patient_number
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.schema import CounterRow
 from services.records.visit_repository import VisitRepository
 
@@ -82,19 +82,19 @@ def test_numbers_of_two_devices_are_disjoint(tmp_path: Path) -> None:
     numbers = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        protocol = load_protocol().for_device(load_or_create_device(tmp_path / name, NO_BOARD).prefix)
-        prefix = protocol.programme.prefix
+        programme = load_programme().for_device(load_or_create_device(tmp_path / name, NO_BOARD).prefix)
+        prefix = programme.numbers.prefix
         numbers.append({automatic_number(prefix, count) for count in range(1, DRAWS + 1)})
     assert [len(series) for series in numbers] == [DRAWS, DRAWS]
     assert not numbers[0] & numbers[1]
 
 
 def test_a_programme_may_leave_the_letters_of_the_device_out() -> None:
-    protocol = load_protocol()
-    programme = protocol.programme.model_copy(update={"device_in_number": False})
-    changed = protocol.model_copy(update={"programme": programme})
-    assert changed.for_device("KFTRW").programme.prefix == "A"
-    assert protocol.for_device("KFTRW").programme.prefix == "AKFTRW"
+    programme = load_programme()
+    numbers = programme.numbers.model_copy(update={"device_in_number": False})
+    changed = programme.model_copy(update={"numbers": numbers})
+    assert changed.for_device("KFTRW").numbers.prefix == "A"
+    assert programme.for_device("KFTRW").numbers.prefix == "AKFTRW"
 
 
 def test_a_number_of_an_earlier_release_is_found_with_and_without_its_prefix(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_a_number_of_an_earlier_release_is_found_with_and_without_its_prefix(tmp
 def test_an_export_without_a_picture_names_its_device(tmp_path: Path) -> None:
     device = load_or_create_device(tmp_path, NO_BOARD)
     with CaptureStore(tmp_path) as store:
-        visit = VisitRepository(store.engine, load_protocol(), VirtualClock()).begin("0" * 16)
+        visit = VisitRepository(store.engine, load_programme(), VirtualClock()).begin("0" * 16)
         for files in (export_files(store, visit, None), uploaded_files(store, visit)):
             block = json.loads(files["visit.json"])["device"]
             assert (block["uuid"], block["serial"]) == (device.uuid, device.serial)

@@ -11,7 +11,7 @@ from device.recon.assessment.frame_quality import Code as VerdictCode
 from device.recon.colour_reconstructor import NO_PSF_CODE
 from services.health.alerts import AlertCode
 from services.http.problem_responses import HTTP_STATUS
-from services.records.protocol import Reason
+from services.records.programme import Reason
 from services.records.visit import GREEN_ONLY, OutcomeCode
 from tests.project_files import files, text
 

@@ -24,7 +24,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.command import app
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.recovery_report import RecoveryReport
 from services.records.snapshots import KEPT_VERSIONS, Snapshots
 from services.records.visit import SlotCapture
@@ -49,7 +49,7 @@ def migrations(tmp_path: Path) -> Path:
 
 
 def people(store: CaptureStore) -> VisitRepository:
-    return VisitRepository(store.engine, load_protocol(), VirtualClock())
+    return VisitRepository(store.engine, load_programme(), VirtualClock())
 
 
 def use(folder: Path, number: int) -> None:

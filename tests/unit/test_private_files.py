@@ -25,7 +25,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
 
@@ -53,7 +53,7 @@ def test_a_data_folder_is_private_with_any_umask(umask: int, tmp_path: Path) -> 
     """While it is open, too: the logs of the database have its rows."""
     data, clock = tmp_path / "data", VirtualClock()
     with CaptureStore(data, reserve_bytes=1) as store:
-        visits = VisitRepository(store.engine, load_protocol(), clock)
+        visits = VisitRepository(store.engine, load_programme(), clock)
         visits.begin("0123456789abcdef")
         store.save(Capture("c", "OD", NOON, True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
         DoseLedgerStore(store.engine, clock, 86_400.0, "boot")

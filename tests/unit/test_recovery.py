@@ -18,7 +18,7 @@ from services.errors import StoreDamaged
 from services.records import schema
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_document import RecordDocument, parse_document
 from services.records.record_files import CAPTURE_RECORD as RECORD
@@ -75,7 +75,7 @@ def test_captures_without_rows_are_adopted_with_all_that_was_stored(store: Captu
 
 
 def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> None:
-    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+    people = VisitRepository(store.engine, load_programme(), VirtualClock())
     visit = people.answer(next(KEYS), people.begin(next(KEYS)).id, "consent", "agreed").id
     target = people.pictures.capture_target("OD", None, visit, "R-centre")
     report = CaptureReport(visit=visit, slot="R-centre", verdict=StoredVerdict("good"))
@@ -87,7 +87,7 @@ def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> 
     without_rows(store.folder, "DELETE FROM slot_decisions", *LOST_ROWS)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert again.get("a") == stored, "the record holds the correction of the eye"
-        slots = VisitRepository(again.engine, load_protocol(), VirtualClock()).get(visit).slots
+        slots = VisitRepository(again.engine, load_programme(), VirtualClock()).get(visit).slots
         assert [taken.capture for taken in slots["L-centre"].captures] == ["a"]
         assert slots["L-centre"].captures == moved.slots["L-centre"].captures
 
@@ -192,20 +192,20 @@ def test_the_files_of_a_store_alone_rebuild_all_that_it_shows(filled: tuple[Path
 def test_an_older_database_does_not_undo_later_changes(tmp_path: Path) -> None:
     folder, clock = tmp_path / "store", VirtualClock()
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.begin(next(KEYS)).id
         people.answer(next(KEYS), visit, "age", 40)
         people.answer(next(KEYS), visit, "name", "Asha")
     older = (folder / "store.sqlite").read_bytes()
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         people.answer(next(KEYS), visit, "age", 41)
         people.answer(next(KEYS), visit, "name", "Usha")
         people.finish(next(KEYS), visit)
         latest = people.get(visit), people.get(people.begin(next(KEYS)).id)
     (folder / "store.sqlite").write_bytes(older)
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         assert tuple(people.get(stored_visit.id) for stored_visit in latest) == latest
         assert sorted(store.recovery.visits) == sorted(stored_visit.id for stored_visit in latest)
         assert store.recovery.conflicts == []
@@ -215,7 +215,7 @@ def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path
     folder, clock = tmp_path / "store", VirtualClock()
     begin, press = next(KEYS), next(KEYS)
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.begin(begin).id
         people.answer(next(KEYS), visit, "consent", "agreed")
         target = people.pictures.capture_target("OD", press, visit, "R-centre")
@@ -224,7 +224,7 @@ def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path
         store.save(taken, FILES, target.write_rows, target.request)
     (folder / "store.sqlite").unlink()
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         assert people.begin(begin).id == visit
         assert people.pictures.capture_for_key(press, "OD", visit, "R-centre") == "a"
 
@@ -232,22 +232,22 @@ def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path
 def test_a_change_that_was_killed_between_file_and_commit_is_applied_as_a_whole(tmp_path: Path) -> None:
     folder, clock = tmp_path / "store", VirtualClock()
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.begin(next(KEYS)).id
         people.answer(next(KEYS), visit, "age", 40)
     older = (folder / "store.sqlite").read_bytes()
     with CaptureStore(folder, reserve_bytes=0) as store:
-        changed = VisitRepository(store.engine, load_protocol(), clock).finish(next(KEYS), visit)
+        changed = VisitRepository(store.engine, load_programme(), clock).finish(next(KEYS), visit)
     (folder / "store.sqlite").write_bytes(older)
     for _ in range(2):
         with CaptureStore(folder, reserve_bytes=0) as store:
-            assert VisitRepository(store.engine, load_protocol(), clock).get(visit) == changed
+            assert VisitRepository(store.engine, load_programme(), clock).get(visit) == changed
 
 
 def test_a_change_that_the_database_refuses_leaves_the_files_as_they_were(tmp_path: Path) -> None:
     folder, clock = tmp_path / "store", VirtualClock()
     with CaptureStore(folder, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.begin(next(KEYS)).id
         before = files_of(folder)
         without_rows(
@@ -273,7 +273,7 @@ def test_after_older_tables_were_changed_the_later_change_is_used_and_the_other_
     clock = VirtualClock(start=datetime(2026, 3, 1, 12, tzinfo=UTC))
     snapshots = Snapshots(tmp_path / "store.sqlite", clock)
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.answer(next(KEYS), people.begin(next(KEYS)).id, "age", 50).id
         saved(store, "old")
         snapshots.create("s0001")
@@ -283,7 +283,7 @@ def test_after_older_tables_were_changed_the_later_change_is_used_and_the_other_
     snapshots.restore(snapshots.names()[0])
     without_rows(tmp_path, f"UPDATE answers SET value = '{age}', set_at = '{set_at}' WHERE name = 'age'")
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         assert {capture.id for capture in store.captures()} == {"old", "new"}
         assert {name: store.read("new", name) for name in FILES} == FILES
         assert people.get(visit).fields["age"] == used
@@ -301,7 +301,7 @@ def test_a_number_that_was_given_again_in_older_tables_mixes_up_no_patients(
     snapshots = Snapshots(tmp_path / "store.sqlite", clock)
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         snapshots.create("s0001")
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         visit = people.begin(next(KEYS), number).id
         people.answer(next(KEYS), visit, "name", "Asha")
         people.answer(next(KEYS), visit, "age", 30)
@@ -316,7 +316,7 @@ def test_a_number_that_was_given_again_in_older_tables_mixes_up_no_patients(
     )
     for _ in range(2):
         with CaptureStore(tmp_path, reserve_bytes=0) as store:
-            people = VisitRepository(store.engine, load_protocol(), clock)
+            people = VisitRepository(store.engine, load_programme(), clock)
             found = {
                 stored_visit.id: (stored_visit.number, stored_visit.fields["name"], stored_visit.fields["age"])
                 for stored_visit in people.visits(10)
@@ -330,7 +330,7 @@ def documents(folder: Path) -> list[RecordDocument]:
 
 
 def test_a_damaged_id_of_a_patient_is_restored(store: CaptureStore) -> None:
-    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+    people = VisitRepository(store.engine, load_programme(), VirtualClock())
     people.answer(next(KEYS), people.begin(next(KEYS)).id, "name", "Asha")
     before = people.visits(10)
     store.close()
@@ -338,7 +338,7 @@ def test_a_damaged_id_of_a_patient_is_restored(store: CaptureStore) -> None:
     changed = ("f" if id[0] != "f" else "e") + id[1:]
     flip(store.folder / "store.sqlite", id.encode(), changed.encode())
     with CaptureStore(store.folder, reserve_bytes=0) as again:
-        assert VisitRepository(again.engine, load_protocol(), VirtualClock()).visits(10) == before
+        assert VisitRepository(again.engine, load_programme(), VirtualClock()).visits(10) == before
     assert [document.id for document in documents(store.folder)] == [id]
 
 

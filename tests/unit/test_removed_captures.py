@@ -14,7 +14,7 @@ from services.errors import RecordRemoved, StoreDamaged
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.export_records import ExportRecords
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.removed_captures import MARK, Removal, is_large
 from services.records.store_check import check_store
 from services.records.upload_queue import UploadQueue, UploadReceipt
@@ -125,7 +125,7 @@ def test_a_lost_file_is_not_called_removed(store: CaptureStore) -> None:
 def test_a_finished_visit_is_removable_once_it_was_sent_or_exported(tmp_path: Path) -> None:
     keys, clock = (f"{number:016x}" for number in count()), VirtualClock()
     with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
-        people = VisitRepository(store.engine, load_protocol(), clock)
+        people = VisitRepository(store.engine, load_programme(), clock)
         removal, finished = PictureRemoval(store, people, clock), list[Visit]()
         for number in range(3):
             id = people.begin(next(keys)).id

@@ -17,7 +17,7 @@ from services.http.schemas.captures import capture_answer
 from services.http.schemas.status import AlertAnswer
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.visit import SlotState, Visit
 from services.records.visit_repository import VisitRepository
 
@@ -66,10 +66,10 @@ def test_values_that_are_not_known_have_no_key() -> None:
 
 
 def test_a_visit_with_an_impossible_answer_is_damaged(tmp_path: Path) -> None:
-    slots = {slot.id: SlotState() for slot in load_protocol().slots}
+    slots = {slot.id: SlotState() for slot in load_programme().slots}
     visit = Visit("v1", "A1", "2026-03-01", datetime(2026, 3, 1, tzinfo=UTC), {"age": {"years": 1}}, slots)
     with CaptureStore(tmp_path, reserve_bytes=0) as store, pytest.raises(StoreDamaged, match="v1"):
-        visit_answer(visit, VisitRepository(store.engine, load_protocol(), VirtualClock()))
+        visit_answer(visit, VisitRepository(store.engine, load_programme(), VirtualClock()))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from services.errors import StoreLocked
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.read_only_store import opened_store
 from services.records.visit_repository import VisitRepository
 from tests.project_files import ROOT
@@ -110,7 +110,7 @@ def test_a_store_that_may_only_be_read_is_shown_and_takes_nothing(folder: Path) 
             ledger = DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, "boot")
             with pytest.raises(StoreReadOnly):
                 ledger.reserve(("OD",), 0.0, 1.0)
-            people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+            people = VisitRepository(store.engine, load_programme(), VirtualClock())
             with pytest.raises(StoreReadOnly):
                 people.begin("0123456789abcdef")
 

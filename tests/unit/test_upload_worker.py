@@ -29,7 +29,7 @@ from services.errors import (
 from services.health.alerts import upload_alerts
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.records.upload_queue import STUCK_AFTER, UploadQueue, UploadReceipt
 from services.records.visit_repository import VisitRepository
 
@@ -48,7 +48,7 @@ class QueueSetup:
     queue: UploadQueue = field(init=False)
 
     def __post_init__(self) -> None:
-        self.repository = VisitRepository(self.store.engine, load_protocol(), self.clock)
+        self.repository = VisitRepository(self.store.engine, load_programme(), self.clock)
         self.queue = UploadQueue(self.store.engine, self.clock)
 
     def begin(self) -> str:

@@ -19,7 +19,7 @@ from services import resources
 from services.archive.plan import read_plan
 from services.delivery.uploader import load_settings as load_upload_settings
 from services.http.static_files import StaticFiles
-from services.records.protocol import load_protocol
+from services.records.programme import load_programme
 from services.update.settings import load_settings as load_update_settings
 from services.update.sources import find_bundle, list_bundles
 from tests.companions import add_companions, apple_double
@@ -29,7 +29,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "head": load_head,
     "sensor": lambda path: sensor_profile(path.name, path.parent),
     "light path": load_light_path,
-    "programme": load_protocol,
+    "programme": load_programme,
     "upload": load_upload_settings,
     "update": load_update_settings,
     "plan": read_plan,

@@ -12,7 +12,7 @@ from device.errors import SpecError
 from services.errors import IdempotencyKeyConflict, RecordNotFound, VisitFinished
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
-from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
+from services.records.programme import DEFAULT_PROGRAMME, load_programme
 from services.records.visit_repository import VisitRepository
 
 FILES = {"raw.tiff": b"raw" * 100, "report.json": b"{}"}
@@ -27,7 +27,7 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
 
 @pytest.fixture
 def people(store: CaptureStore) -> VisitRepository:
-    return VisitRepository(store.engine, load_protocol(), VirtualClock())
+    return VisitRepository(store.engine, load_programme(), VirtualClock())
 
 
 def agreed(people: VisitRepository) -> str:
@@ -127,16 +127,17 @@ def test_an_idempotency_key_belongs_to_one_request(people: VisitRepository) -> N
         ('eye = "both"', "eye"),
         ('id = "R-centre"', "same id"),
         ("retakes = -1", "retakes"),
+        ("version = 2", "version"),
         ('colour = "green"', "not a known key"),
     ],
 )
 def test_an_invalid_protocol_is_refused_with_the_key_of_the_mistake(tmp_path: Path, change: str, named: str) -> None:
     key = change.split(" ")[0]
-    lines = [change if line.startswith(f"{key} ") else line for line in DEFAULT_PROTOCOL.read_text().splitlines()]
+    lines = [change if line.startswith(f"{key} ") else line for line in DEFAULT_PROGRAMME.read_text().splitlines()]
     lines = lines if change in lines else [change, *lines]
-    (tmp_path / "protocol.toml").write_text("\n".join(lines))
+    (tmp_path / "programme.toml").write_text("\n".join(lines))
     with pytest.raises(SpecError, match=named):
-        load_protocol(tmp_path / "protocol.toml")
+        load_programme(tmp_path / "programme.toml")
 
 
 @pytest.mark.parametrize(

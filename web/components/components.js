@@ -60,7 +60,7 @@ function faceOf(state, id) {
 export function tiles(state, actions) {
   return html`
     <div class="tiles" role="group" aria-label=${t("part.tiles")}>
-      ${(state.protocol?.slots ?? []).map((plan) => tile(state, actions, plan))}
+      ${(state.programme?.slots ?? []).map((plan) => tile(state, actions, plan))}
     </div>
   `;
 }
@@ -237,11 +237,11 @@ function finishQuestion(state, actions) {
  * Reasons of the programme why a picture could not be taken, as buttons.
  * @param {State} state
  */
-function reasons({ protocol, route }, actions) {
+function reasons({ programme, route }, actions) {
   return html`
     <div class="reasons" role="group" aria-labelledby="why">
       <h2 id="why">${t("result.why")}</h2>
-      ${(protocol?.reasons ?? []).map(
+      ${(programme?.reasons ?? []).map(
         (reason) => html`<button type="button" data-reason=${reason} @click=${() => actions.notPossible(route.slot, reason)}>
           ${has(`reason.${reason}`) ? t(`reason.${reason}`) : reason}
         </button>`,

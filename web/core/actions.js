@@ -21,7 +21,7 @@ const THUMB_RETRY_MS = 1000;
 const THUMB_RETRY_MAX_MS = 64_000;
 const TOOL_STEPS = 5; // largest step of brightness and contrast, in either direction
 
-const firstSlot = () => get().visit?.next_slot ?? get().protocol?.slots[0].id;
+const firstSlot = () => get().visit?.next_slot ?? get().programme?.slots[0].id;
 const goToAim = (slot) => navigate({ screen: "aim", visit: currentRoute().visit, slot });
 
 const navigationActions = {

@@ -54,7 +54,7 @@ async function requestJson(path, options = {}) {
 }
 
 export const getStatus = () => requestJson("/api/status");
-export const getProtocol = () => requestJson("/api/protocol");
+export const getProgramme = () => requestJson("/api/programme");
 export const getVisit = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}`);
 const montageUrl = (visit, eye) => `/api/visits/${encodeURIComponent(visit)}/montage/${encodeURIComponent(eye)}`;
 export const getMontage = (visit, eye) => requestJson(montageUrl(visit, eye));

@@ -36,7 +36,7 @@ function onFind({ key, target }, actions) {
 
 function onLetter(event, actions) {
   const { key } = event;
-  const { route, redfree, loupe, protocol } = get();
+  const { route, redfree, loupe, programme } = get();
   const capture = currentCapture(get());
   const hasVerdict = route.screen === "picture" && capture && (capture.over || capture.verdict);
   const once = (action) => acceptKey(event) && action();
@@ -46,7 +46,7 @@ function onLetter(event, actions) {
     ...(hasVerdict ? { r: () => once(actions.again), n: () => once(actions.next), ArrowRight: () => once(actions.next), ...viewerKeys(actions, redfree, loupe) } : {}),
   };
   const exam = route.screen === "aim" || route.screen === "picture";
-  if (exam && /^[1-9]$/.test(key) && protocol?.slots[key - 1]) actions.chooseTile(protocol.slots[key - 1].id);
+  if (exam && /^[1-9]$/.test(key) && programme?.slots[key - 1]) actions.chooseTile(programme.slots[key - 1].id);
   else keys[key.length === 1 ? key.toLowerCase() : key]?.();
 }
 

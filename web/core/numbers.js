@@ -7,7 +7,7 @@ import { get } from "./state.js";
  * numbers are easy to tell apart.
  */
 export function displayNumber(number) {
-  const prefix = get().protocol?.programme?.prefix;
+  const prefix = get().programme?.numbers?.prefix;
   const automatic = prefix && number.startsWith(prefix) && /^\d{5,}$/.test(number.slice(prefix.length));
   return automatic ? `${number.slice(0, -1)}-${number.slice(-1)}` : number;
 }

@@ -62,9 +62,9 @@ const settings = Object.freeze({
  *   record?: CaptureRecord, failed?: {code: string, message: string, remedy: string}, answerLost?: boolean, reloaded?: boolean}} Capture
  * @typedef {{code: string, level: string, rank: number, buttons: string[], from: string, until: number, [more: string]: any}} Alert
  * @typedef {{id: string, eye: string, field: string, required: boolean}} SlotPlan
- * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, programme: Record<string, any>}} Protocol
+ * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, referral: Record<string, any>, numbers: Record<string, any>}} Programme
  * @typedef {{link: string, status: any, activity: string, hasControl: boolean, alerts: readonly Alert[],
- *   route: import("./router.js").Route, protocol: Protocol | null, visit: Visit | null, visits: Visit[] | null,
+ *   route: import("./router.js").Route, programme: Programme | null, visit: Visit | null, visits: Visit[] | null,
  *   counts: {done: number, to_finish: number, referred: number, declined: number} | null, typed: string, listFilter: string,
  *   captures: readonly Capture[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
  *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: string, zoom: number, note: string,
@@ -83,7 +83,7 @@ export const store = createStore(/** @type {State} */ ({
   hasControl: false, // this page holds the control lease, which live pictures need; another page can take it
   alerts: Object.freeze([]), // active alerts, see alerts.js
   route: Object.freeze({ screen: "home" }),
-  protocol: null, // slots, reasons and retakes of the programme
+  programme: null, // slots, reasons and retakes of the programme
   visit: null,
   visits: null, // the list on the current screen
   counts: null,
@@ -143,8 +143,8 @@ export const moveCapture = (id, { id: slot, eye }) =>
  * Return the number of required slots of the visit that have neither a picture, nor one in progress, nor a reason.
  * @param {State} state
  */
-export const missingPictures = ({ visit, protocol, captures }) =>
-  (protocol?.slots ?? []).filter(
+export const missingPictures = ({ visit, programme, captures }) =>
+  (programme?.slots ?? []).filter(
     ({ id, required }) =>
       required && visit?.slots[id]?.state === "empty" && !captures.some((capture) => capture.visit === visit.id && capture.slot === id && !capture.over),
   ).length;
@@ -178,7 +178,7 @@ export const allowsLight = ({ route, visit }) => visit !== null && visit.id === 
  * @param {State} state
  * @param {string | null | undefined} id
  */
-export const slotPlan = ({ protocol }, id) => protocol?.slots.find((slot) => slot.id === id) ?? null;
+export const slotPlan = ({ programme }, id) => programme?.slots.find((slot) => slot.id === id) ?? null;
 /**
  * Return the definition of the slot with the same field of the other eye.
  * @param {State} state
@@ -186,7 +186,7 @@ export const slotPlan = ({ protocol }, id) => protocol?.slots.find((slot) => slo
  */
 export function otherEyeSlot(state, id) {
   const here = slotPlan(state, id);
-  return state.protocol?.slots.find(({ eye, field }) => eye !== here?.eye && field === here?.field) ?? null;
+  return state.programme?.slots.find(({ eye, field }) => eye !== here?.eye && field === here?.field) ?? null;
 }
 
 /** @type {(state: State, slot: string | null | undefined) => string} */

@@ -55,7 +55,7 @@ let montagePoll = 0;
 /** Load the montage of each eye of the visit on the pictures screen; ask again while one is being computed. */
 export async function refreshMontages(visit) {
   const isShown = () => get().route.screen === "pictures" && get().route.visit === visit;
-  const eyes = [...new Set((get().protocol?.slots ?? []).map(({ eye }) => eye))];
+  const eyes = [...new Set((get().programme?.slots ?? []).map(({ eye }) => eye))];
   const answers = await Promise.all(eyes.map(async (eye) => [eye, await alertOnError(() => getMontage(visit, eye))]));
   if (!isShown()) return;
   set({ montages: Object.freeze(Object.fromEntries(answers.filter(([, answer]) => answer))) });
@@ -203,9 +203,9 @@ export const confirmEye = (slot, capture) =>
 
 /** Return the next empty slot after `after` in the order of the programme; null if there is none. */
 export function nextSlot(after) {
-  const { visit, protocol } = get();
-  if (!visit || !protocol) return null;
-  const ids = protocol.slots.map(({ id }) => id);
+  const { visit, programme } = get();
+  if (!visit || !programme) return null;
+  const ids = programme.slots.map(({ id }) => id);
   const order = [...ids.slice(ids.indexOf(after) + 1), ...ids.slice(0, ids.indexOf(after))];
   const making = pendingCaptures(get(), visit.id).map(({ slot }) => slot);
   const missing = order.filter((id) => id !== after && visit.slots[id]?.state === "empty" && !making.includes(id));
@@ -240,7 +240,7 @@ export async function retryUploads(visit) {
  */
 export async function finish({ isSure = false } = {}) {
   const { visit } = get().route;
-  if (!visit || !get().protocol || get().visit?.id !== visit) return; // still loading: what is missing is not known yet
+  if (!visit || !get().programme || get().visit?.id !== visit) return; // still loading: what is missing is not known yet
   if (!isSure && missingPictures(get()) && get().visit?.fields.consent !== "declined") return set({ asking: "finish" });
   lowerAlert("shot.crossed"); // undo would need a reopened visit
   if (pendingCaptures(get(), visit).length) {
@@ -275,7 +275,7 @@ export async function copyTo({ id: folder, name }) {
 }
 
 /** Return the content of the QR code: number, date, outcome, telephone of the centre. Never a picture, name or age. */
-export function qrText({ visit, protocol }) {
+export function qrText({ visit, programme }) {
   const day = (visit.finished_at ?? visit.begun_at).slice(0, 10);
-  return [visit.number, day, visit.outcome.code, protocol?.programme?.centre_phone].filter(Boolean).join("\n");
+  return [visit.number, day, visit.outcome.code, programme?.referral?.centre_phone].filter(Boolean).join("\n");
 }

@@ -95,8 +95,8 @@ function qrFigure({ size, path }) {
  * @param {string[]} texts
  * @param {State} state
  */
-function slip(visit, [headline, sentence], { protocol, qrCode: drawn }) {
-  const phone = protocol?.programme?.centre_phone;
+function slip(visit, [headline, sentence], { programme, qrCode: drawn }) {
+  const phone = programme?.referral?.centre_phone;
   const moment = visit.finished_at ?? visit.begun_at;
   return html`<section class="slip" aria-hidden="true">
     <p class="slip-number">${patientLabel(visit)}</p>

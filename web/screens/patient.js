@@ -61,7 +61,7 @@ export function patient(state, actions) {
  * @param {import("../core/state.js").Visit} visit
  * @param {State} state
  */
-function startButton(visit, { protocol }, actions) {
+function startButton(visit, { programme }, actions) {
   const { consent } = visit.fields;
   const any = Object.values(visit.slots).some(({ captures }) => captures.length);
   if (consent === "declined") {
@@ -71,7 +71,7 @@ function startButton(visit, { protocol }, actions) {
       </button>
     </div>`;
   }
-  const ready = consent === "agreed" && protocol !== null;
+  const ready = consent === "agreed" && programme !== null;
   return html`<div class="go">
     <button class="primary big" type="button" id="shoot" aria-disabled=${!ready} @click=${() => ready && actions.startAiming()}>
       ${icon("camera")} <span>${t(ready ? "patient.shoot" : "patient.ask")}</span>

@@ -39,7 +39,7 @@ function triesOf({ visit }, capture) {
 
 /** @param {State} state */
 const exhausted = (state, capture) =>
-  capture.verdict?.code === "shot.poor" || triesOf(state, capture) > (state.protocol?.retakes ?? 2);
+  capture.verdict?.code === "shot.poor" || triesOf(state, capture) > (state.programme?.retakes ?? 2);
 
 // ---- card: same height with and without a verdict, so that the layout does not shift
 

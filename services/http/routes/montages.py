@@ -16,7 +16,7 @@ def montage_router(repository: VisitRepository, montages: MontageMaker) -> APIRo
     router = APIRouter()
 
     def found(id: str, eye: Eye) -> VisitMontage:
-        return montages.montage(repository.get(id), repository.protocol, eye)
+        return montages.montage(repository.get(id), repository.programme, eye)
 
     @router.get("/api/visits/{id}/montage/{eye}")
     def montage(id: str, eye: Eye) -> MontageAnswer:

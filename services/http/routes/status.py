@@ -100,7 +100,7 @@ def status_answer(
             InterruptedCaptureAnswer.model_validate(capture) for capture in interrupted_captures(arbiter, repository)
         ],
         space_left=store.space.captures_left(),
-        people_left=store.space.visits_left(len(repository.protocol.slots)),
+        people_left=store.space.visits_left(len(repository.programme.slots)),
         controller=lease.holder,
         problem=problem_body(problem) if problem else None,
         standing=[AlertAnswer.model_validate(alert) for alert in alerts.active_alerts()],

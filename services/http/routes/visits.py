@@ -20,7 +20,7 @@ from services.http.schemas.visits import (
     VisitList,
 )
 from services.instrument.pending_captures import PendingCaptures
-from services.records.protocol import Protocol
+from services.records.programme import Programme
 from services.records.row_validation import reading_record, without_damaged
 from services.records.visit import Visit
 from services.records.visit_document import VisitDocument, visit_document
@@ -45,10 +45,10 @@ def _read_router(repository: VisitRepository) -> APIRouter:
     """Return the router of the endpoints that read the programme and visits."""
     router = APIRouter()
 
-    @router.get("/api/protocol")
-    def protocol() -> Protocol:
+    @router.get("/api/programme")
+    def programme() -> Programme:
         """Return the programme: picture slots, form fields and rules of a visit."""
-        return repository.protocol
+        return repository.programme
 
     @router.get("/api/visits")
     def visits(

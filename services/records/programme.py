@@ -1,4 +1,4 @@
-"""Screening protocol, read from a TOML file: picture slots, retakes, reasons, and the settings of the programme."""
+"""Screening programme, read from a TOML file: picture slots, retakes, reasons, rules of referral, patient numbers."""
 
 from pathlib import Path
 from typing import Literal, Self, get_args
@@ -11,7 +11,7 @@ from services.errors import RecordNotFound
 from services.records.capture import OtherColour
 from services.records.capture_target import COLOURS, FRAMES
 
-DEFAULT_PROTOCOL = Path(__file__).parent / "protocol.toml"
+DEFAULT_PROGRAMME = Path(__file__).parent / "programme.toml"
 CHOOSE_REMEDY = "Choose one of the pictures on the page."
 
 Reason = Literal["lids", "pupil", "cloudy", "still", "refused", "device", "other"]
@@ -31,33 +31,39 @@ class Slot(Table):
     required: bool = True
 
 
-class Programme(Table):
-    """Settings of the programme.
-
-    `vision_limit`: lowest visual acuity that is not referred; `prefix`: prefix of automatic patient numbers;
-    `device_in_number`: the letters of the device follow the prefix, so that no two devices give the same number.
-    """
+class Referral(Table):
+    """Rules of referral: `vision_limit`, the lowest visual acuity that is not referred; telephone of the centre."""
 
     vision_limit: Vision
-    prefix: str = Field(pattern="^[A-Z]{0,4}$")
-    device_in_number: bool = True
     centre_phone: str | None = Field(default=None, max_length=40)
 
 
-class Protocol(Table):
-    """Screening protocol: picture slots in their order, permitted reasons why a picture is not possible, programme.
+class PatientNumbers(Table):
+    """Automatic patient numbers: their prefix.
 
-    `retakes`: number of permitted retakes of a slot. `frames`: number of frames of one picture; more frames give more
-    light, so less noise, and take longer. `colours`: other colours of light, of which one frame each is taken; blue
-    only if it is listed.
+    `device_in_number`: the letters of the device follow the prefix, so that no two devices give the same number.
     """
 
+    prefix: str = Field(pattern="^[A-Z]{0,4}$")
+    device_in_number: bool = True
+
+
+class Programme(Table):
+    """Screening programme: picture slots in their order, permitted reasons why a picture is not possible, rules.
+
+    `version`: version of this schema. `retakes`: number of permitted retakes of a slot. `frames`: number of frames of
+    one picture; more frames give more light, so less noise, and take longer. `colours`: other colours of light, of
+    which one frame each is taken; blue only if it is listed.
+    """
+
+    version: Literal[1]
     slots: tuple[Slot, ...] = Field(min_length=1, max_length=16)
     reasons: tuple[Reason, ...] = REASONS
     retakes: int = Field(ge=0, le=10)
     frames: int = Field(default=FRAMES, ge=1, le=FRAMES)
     colours: tuple[OtherColour, ...] = COLOURS
-    programme: Programme
+    referral: Referral
+    numbers: PatientNumbers
 
     @model_validator(mode="after")
     def _slots_differ(self) -> Self:
@@ -68,18 +74,18 @@ class Protocol(Table):
         return self
 
     def for_device(self, letters: str) -> Self:
-        """Return the protocol with the letters of a device behind the prefix of its numbers, if it wants them."""
-        if not self.programme.device_in_number:
+        """Return the programme with the letters of a device behind the prefix of its numbers, if it wants them."""
+        if not self.numbers.device_in_number:
             return self
-        programme = self.programme.model_copy(update={"prefix": self.programme.prefix + letters})
-        return self.model_copy(update={"programme": programme})
+        numbers = self.numbers.model_copy(update={"prefix": self.numbers.prefix + letters})
+        return self.model_copy(update={"numbers": numbers})
 
     def slot(self, id: str) -> Slot:
         """Return the slot with that id; RecordNotFound if there is none."""
         for slot in self.slots:
             if slot.id == id:
                 return slot
-        raise RecordNotFound(f"there is no picture named {id!r} in the protocol", CHOOSE_REMEDY)
+        raise RecordNotFound(f"there is no picture named {id!r} in the programme", CHOOSE_REMEDY)
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
@@ -87,6 +93,6 @@ class Protocol(Table):
         return tuple(eye for eye in EYES if any(slot.eye == eye and slot.required for slot in self.slots))
 
 
-def load_protocol(path: Path = DEFAULT_PROTOCOL) -> Protocol:
-    """Return the protocol in a TOML file; SpecError with file, line and key of the first mistake."""
-    return load_toml(path, Protocol)
+def load_programme(path: Path = DEFAULT_PROGRAMME) -> Programme:
+    """Return the programme in a TOML file; SpecError with file, line and key of the first mistake."""
+    return load_toml(path, Programme)
