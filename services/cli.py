@@ -38,6 +38,7 @@ GROUPS = {
     "store": "services.backup.command",
     "archive": "services.archive.command",
     "programme": "services.records.programme_command",
+    "users": "services.identity.users_command",
 }
 
 
@@ -66,7 +67,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography", "pyrage"})
+INSTRUMENT_PACKAGES = frozenset(
+    {"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography", "pyrage", "argon2"}
+)
 ARCHIVE_PACKAGES = frozenset({"distributed", "dask", "pyarrow"})
 SIM_HEAD = resources.HEADS / "sim.toml"
 

@@ -6,7 +6,13 @@ DiffuscopeError                       base class in device/errors.py
 ├── AuthenticationError               authentication of the technician
 │   ├── LoginRequired                 no login, or login expired
 │   ├── PinWrong                      wrong or invalid PIN
-│   └── PinLockedOut                  lock-out after repeated wrong PINs
+│   ├── PinLockedOut                  lock-out after repeated wrong PINs
+│   ├── SignInRequired                not signed in, or the login ended
+│   ├── SetupRequired                 no user exists yet
+│   ├── ConfirmationRequired          PIN to be typed again before a risk
+│   ├── AccessDenied                  the roles of the user do not permit it
+│   ├── SecretWrong                   wrong name, PIN, passphrase or set-up code
+│   └── SignInLockedOut               lock-out after repeated wrong secrets
 ├── Busy                              the instrument is occupied
 ├── RequestRefused                    request not permitted, or not now
 │   ├── ControlLeaseHeld              another screen holds the control lease
@@ -89,6 +95,48 @@ class PinLockedOut(AuthenticationError):
     """Lock-out after repeated wrong PINs: the next attempt has to wait."""
 
     code = "technician.wait"
+    default_remedy = "Wait until the time is over, then try again."
+
+
+class SignInRequired(AuthenticationError):
+    """No user is signed in: no login, or it expired, was locked or was revoked."""
+
+    code = "access.none"
+    default_remedy = "Sign in with your name and PIN."
+
+
+class SetupRequired(AuthenticationError):
+    """No user exists yet, and the request does not come from a demonstration."""
+
+    code = "access.setup"
+    default_remedy = "Create the first administrator with the set-up code of this device."
+
+
+class ConfirmationRequired(AuthenticationError):
+    """An action with a risk, and the secret was typed too long ago."""
+
+    code = "access.confirm"
+    default_remedy = "Type your PIN once more, then repeat it."
+
+
+class AccessDenied(AuthenticationError):
+    """The roles of the signed-in user do not permit the request."""
+
+    code = "access.role"
+    default_remedy = "Ask an administrator for this right, or let another user do it."
+
+
+class SecretWrong(AuthenticationError):
+    """Name and secret do not belong together, or the set-up code is wrong."""
+
+    code = "access.wrong"
+    default_remedy = "Type name and PIN again. An administrator can give a new PIN."
+
+
+class SignInLockedOut(AuthenticationError):
+    """Lock-out after repeated wrong secrets; `wait_s` is the time until the next attempt."""
+
+    code = "access.wait"
     default_remedy = "Wait until the time is over, then try again."
 
 
