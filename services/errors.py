@@ -3,11 +3,8 @@
 HTTP status codes: `HTTP_STATUS` in services/http.
 
 DiffuscopeError                       base class in device/errors.py
-├── AuthenticationError               authentication of the technician
-│   ├── LoginRequired                 no login, or login expired
-│   ├── PinWrong                      wrong or invalid PIN
-│   ├── PinLockedOut                  lock-out after repeated wrong PINs
-│   ├── SignInRequired                not signed in, or the login ended
+├── AuthenticationError               authentication and rights of a user
+│   ├── LoginRequired                 not signed in, or the login ended
 │   ├── SetupRequired                 no user exists yet
 │   ├── ConfirmationRequired          PIN to be typed again before a risk
 │   ├── AccessDenied                  the roles of the user do not permit it
@@ -71,34 +68,13 @@ NO_FILES_REMEDY = (
 
 
 class AuthenticationError(DiffuscopeError):
-    """Authentication of the technician failed."""
+    """Authentication failed, or the right is missing."""
 
-    code = "technician"
-    default_remedy = "Go back to the pictures, or call the technician."
+    code = "access"
+    default_remedy = "Sign in again, or ask an administrator."
 
 
 class LoginRequired(AuthenticationError):
-    """No technician is logged in, the login has expired, or no PIN is set yet."""
-
-    code = "technician.locked"
-    default_remedy = "Give the technician's PIN."
-
-
-class PinWrong(AuthenticationError):
-    """The PIN is not that of the device, or a new PIN has an invalid format."""
-
-    code = "technician.pin"
-    default_remedy = "Give the PIN that was set on this device: 4 to 12 digits."
-
-
-class PinLockedOut(AuthenticationError):
-    """Lock-out after repeated wrong PINs: the next attempt has to wait."""
-
-    code = "technician.wait"
-    default_remedy = "Wait until the time is over, then try again."
-
-
-class SignInRequired(AuthenticationError):
     """No user is signed in: no login, or it expired, was locked or was revoked."""
 
     code = "access.none"
@@ -374,7 +350,7 @@ class UpdateUncommitted(UpdateError):
 
 
 class UpdateDuringExam(UpdateError):
-    """An examination is in progress: a picture is being taken, or a visit was begun recently and is open."""
+    """An examination is in progress: a picture is being taken, or was taken in the last minutes."""
 
     code = "update.exam"
     default_remedy = "Finish the examination first, then start the update again."

@@ -20,8 +20,8 @@ from device.calibration.archive import Archive
 from device.clock import VirtualClock
 from device.errors import CalibrationDamaged, CalibrationMissing, DiffuscopeError
 from services.backup.backup_key import KEY_FILE, key_for_recipients, read_key, write_key
-from services.errors import BackupDamaged, LoginRequired, RecordNotFound, StoreDamaged
-from services.http.authentication import PinAuthenticator
+from services.errors import BackupDamaged, RecordNotFound, StoreDamaged
+from services.identity.users import UserTable
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
@@ -35,7 +35,7 @@ from services.records.visit_repository import VisitRepository
 from tests.unit.test_archive import WHO, calibration
 
 VISITS = 4
-PIN = "2580"
+PIN = "274913"
 RECIPIENT = "age1zvkyg2lqzraa2lnjvqej32nkuu0ues2s82hzrye869xeexvn73equnujwj"  # a public key of the tests of age
 RECORD_FOLDERS = ("captures", "patients", "visits")
 WINDOW_S = 86_400.0
@@ -89,7 +89,7 @@ def filled_store(folder: Path, *, with_log: bool) -> Path:
         queue.record_success(first, UploadReceipt("0" * 64, "sha256"))
         CaptureJournal(store).begin(InterruptedCapture("2026-9-OD", "OD", visit, "R-centre", 1), next(keys))
         Archive(original / "calibrations" / "head").add_and_activate(calibration(), WHO)
-        PinAuthenticator(original / "technician.json", clock).set_pin(PIN, None)
+        UserTable(original / "access").add("Asha", PIN, ["administrator"])
         write_key(original, key_for_recipients([RECIPIENT]))
         if with_log:
             return shutil.copytree(original, folder / "with log")
@@ -139,13 +139,13 @@ def settings_of(folder: Path, journal: tuple[InterruptedCapture, ...]) -> tuple[
     )
     reads: dict[str, Callable[[], object]] = {
         "calibration": lambda: Archive(folder / "calibrations" / "head").load().calibration.id,
-        "login": lambda: bool(PinAuthenticator(folder / "technician.json", VirtualClock()).log_in(PIN)),
+        "login": lambda: UserTable(folder / "access").verify("Asha", PIN),
         "key": lambda: read_key(folder),
     }
     for name, read in reads.items():
         try:
             value = read()
-        except (CalibrationDamaged, CalibrationMissing, StoreDamaged, BackupDamaged, LoginRequired):
+        except (CalibrationDamaged, CalibrationMissing, StoreDamaged, BackupDamaged):
             value = None
         reported += value is None
         if value is not None:
@@ -269,7 +269,7 @@ def targets(folder: Path, which: str) -> list[Path]:
     of_records = [path for path in every if path.relative_to(folder).parts[0] in RECORD_FOLDERS]
     if which == "files":
         return of_records
-    others = {"calibrations", "journal", "technician.json", KEY_FILE}
+    others = {"calibrations", "journal", "access", KEY_FILE}
     return [path for path in every if path.relative_to(folder).parts[0] in others]
 
 

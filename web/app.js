@@ -7,6 +7,8 @@ import { EventStream, getCapture, getProgramme, releaseControl } from "./core/ap
 import { page } from "./screens/page_layout.js";
 import { goOnWhenShown, stay } from "./core/going_on.js";
 import { bindKeys } from "./core/keyboard.js";
+import { checkLogin, reportActivity } from "./core/login.js";
+import "./components/user_login.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
 import { resetPictureTools, captureEventHandlers, openPicture, rejectForeignCapture } from "./core/capture.js";
@@ -126,8 +128,10 @@ const eventHandlers = {
 
   link(link) {
     set({ link });
-    if (link === "lost") raiseAlert({ code: "link.lost", from: "page" });
-    else lowerAlert("link.lost");
+    if (link === "lost") {
+      raiseAlert({ code: "link.lost", from: "page" });
+      checkLogin(); // the server ends the stream with the login
+    } else lowerAlert("link.lost");
     if (link === "live") refresh();
   },
 
@@ -171,6 +175,14 @@ async function refresh() {
 // requests control again.
 addEventListener("pagehide", releaseControl);
 
+for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => get().user && reportActivity(), { passive: true });
+
+// A user has signed in: what the page shows stays, and is read again.
+document.addEventListener("login-changed", (event) => {
+  set({ user: /** @type {CustomEvent} */ (event).detail });
+  refresh();
+});
+
 // ---- render
 
 /** @param {State} state */
@@ -193,3 +205,4 @@ bindKeys(actions);
 startRouter(showRoute);
 renderPage(get());
 new EventStream(eventHandlers);
+set({ user: await checkLogin() });

@@ -12,23 +12,25 @@ from services.delivery.upload_worker import UploadWorker, archive_builder
 from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
 from services.health.alert_monitor import AlertMonitor, AlertSources
-from services.http.authentication import PinAuthenticator
+from services.http.access import access_required
+from services.http.authentication import Authenticator
 from services.http.client_limits import PREVIEW_LIMITS, STREAM_LIMITS, ClientLimits, limit_clients
 from services.http.control_lease import ControlLease
-from services.http.dependencies import acquire_control_lease, acquire_lease_for_light, login_required
+from services.http.dependencies import acquire_control_lease, acquire_lease_for_light
 from services.http.openapi import DocumentedApp
 from services.http.problem_responses import problem_response, register_error_handlers
 from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
 from services.http.routes.events import event_router
 from services.http.routes.exports import exports_router
+from services.http.routes.login import login_router
 from services.http.routes.montages import montage_router
 from services.http.routes.preview import preview_router
 from services.http.routes.removal import removal_routes
 from services.http.routes.status import status_router
-from services.http.routes.technician import login_router
 from services.http.routes.updates import UPLOAD_PATH
 from services.http.routes.uploads import upload_router
+from services.http.routes.users import users_router
 from services.http.routes.visits import visits_router
 from services.http.schemas.problems import ProblemResponse
 from services.http.security import BodyLimit, CrossOriginProtection, HeadRequests, SecurityHeaders, own_host_names
@@ -60,7 +62,7 @@ class Application:
 
 def create_app(
     arbiter: HeadArbiter,
-    authenticator: PinAuthenticator,
+    authenticator: Authenticator,
     programme: Programme | None = None,
     host_names: tuple[str, ...] | None = None,
     usb_drives: UsbDrives | None = None,
@@ -72,8 +74,8 @@ def create_app(
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
     `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
-    name of this computer. `programme` None loads the default programme. `technician_routers` are routers that require
-    the technician's login. `uploader` uploads finished visits; None means that no receiver is set up.
+    name of this computer. `programme` None loads the default programme. `technician_routers` are those of the
+    technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
     """
     store = arbiter.context.store
@@ -87,7 +89,7 @@ def create_app(
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.owner.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
-    app = _http_application(life, own_host_names() if host_names is None else host_names)
+    app = _http_application(life, authenticator, own_host_names() if host_names is None else host_names)
     pending = PendingCaptures()
     controlled = [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
@@ -101,9 +103,10 @@ def create_app(
     app.include_router(preview_router(arbiter, visits), dependencies=lit)
     app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
     app.include_router(login_router(authenticator))
-    app.include_router(calibration_router(arbiter, authenticator))
+    app.include_router(users_router(authenticator.users))
+    app.include_router(calibration_router(arbiter))
     for router in (*technician_routers, removal_routes(PictureRemoval(store, visits, clock))):
-        app.include_router(router, dependencies=[Depends(login_required(authenticator))])
+        app.include_router(router)
     add_page_routes(app)
     return Application(app, visits, lease, alerts, worker)
 
@@ -120,8 +123,8 @@ def _alert_monitor(
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 
 
-def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAPI:
-    """Return a FastAPI application with problem responses and the security middlewares, the last one outermost."""
+def _http_application(lifespan: Lifespan, authenticator: Authenticator, host_names: tuple[str, ...]) -> FastAPI:
+    """Return a FastAPI application with access control, problem responses and middlewares, the last one outermost."""
     app = DocumentedApp(
         title="Diffuscope",
         version=version("diffuscope"),
@@ -129,6 +132,7 @@ def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAP
         openapi_url="/api/openapi.json",
         docs_url=None,
         redoc_url=None,
+        dependencies=[Depends(access_required(authenticator))],
         responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
     )
     register_error_handlers(app)

@@ -1,132 +1,117 @@
-"""PIN authentication: scrypt hash, lock-out with exponential backoff, one login token with idle timeout."""
+"""Authentication of users: sign-in with lock-out, set-up of the first administrator, the demonstration user."""
 
-import hashlib
-import hmac
-import secrets
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
-from device import atomic_io
+from starlette.requests import HTTPConnection
+
 from device.clock import Clock
-from device.errors import StoreError
-from services.errors import LoginRequired, PinLockedOut, PinWrong, StoreDamaged
-from services.records import digested_json
+from services.errors import RecordNotFound, SecretWrong, SetupRequired, SignInLockedOut
+from services.http.client_limits import Client
+from services.identity.lock_out import LockOut
+from services.identity.logins import Logins
+from services.identity.users import User, UserTable
 
-MIN_DIGITS, MAX_DIGITS = 4, 12  # digits
-IDLE_TIMEOUT_S = 300.0
-MAX_LOCK_OUT_S = 300.0
-SCRYPT_COST: dict[str, int] = {"n": 2**14, "r": 8, "p": 1}  # scrypt: 16 MB and about 50 ms per guess
+# The user of a simulated head before the first real user; only a real administrator changes users.
+DEMO_USER = User("Demo", frozenset({"screener", "reader", "technician"}), is_demo=True)
+PROXY_HEADERS = ("forwarded", "via", "x-forwarded-for")
+SETUP_ACCOUNT, UNKNOWN_ACCOUNT = "set-up", "unknown"
 
 
-class PinAuthenticator:
-    """PIN authentication with one login at a time; only a salted scrypt hash of the PIN is stored, in `file`.
+@dataclass(frozen=True)
+class Peer:
+    """Client of a request: its address, and whether it is the device itself (loopback, and no proxy between)."""
 
-    The first `set_pin` needs no login. A login issues a token, which expires after `IDLE_TIMEOUT_S` without
-    `renew_login` and at the next login. Lock-out: after n wrong PINs in a row further tries are refused for 2^(n-1) s,
-    at most `MAX_LOCK_OUT_S`. Comparisons take constant time. Thread-safe.
+    address: str
+    is_own_screen: bool
+
+    @classmethod
+    def of(cls, request: HTTPConnection) -> "Peer":
+        """Return the client of a request."""
+        client = Client.at(request.client.host if request.client is not None else "")
+        is_own = client.is_local and not any(name in request.headers for name in PROXY_HEADERS)
+        return OWN_SCREEN if is_own else cls(client.address, False)
+
+
+OWN_SCREEN = Peer("own screen", True)
+
+
+class Authenticator:
+    """Users, their logins and the lock-out of one data folder. Thread-safe.
+
+    `has_demo`: until the first user is created, requests from the device itself are those of `DEMO_USER`.
     """
 
-    def __init__(self, file: Path, clock: Clock) -> None:
-        self._file, self._clock = file, clock
-        self._lock = Lock()
-        self._token: str | None = None
-        self._touched_s = 0.0
-        self._wrong = 0
-        self._not_before_s = 0.0
+    def __init__(self, folder: Path, clock: Clock, has_demo: bool = False) -> None:
+        self.users = UserTable(folder)
+        self.logins = Logins(self.users, clock)
+        self._lock_out = LockOut(folder, clock)
+        self._has_demo = has_demo
+        self._verifying = Lock()  # one attempt after the other: each is counted before the next is judged
 
-    @property
-    def has_pin(self) -> bool:
-        """Whether a PIN has been set."""
-        return self._file.exists()
+    def user(self, token: str | None, peer: Peer, acts: bool = False) -> User | None:
+        """Return the user of a request, None if none is signed in; `acts` restarts the idle lock."""
+        if not self.users.has_begun:
+            return DEMO_USER if self._has_demo and peer.is_own_screen else None
+        return self.logins.user(token, acts)
 
-    @property
-    def lock_out_s(self) -> float:
-        """Seconds until the next try is allowed; 0 if it is allowed now."""
-        return max(0.0, self._not_before_s - self._clock.now_s())
+    def wait_s(self, name: str, peer: Peer) -> float:
+        """Return the seconds until the next attempt to sign in with this name; 0 if it is permitted now."""
+        return self._lock_out.wait_s(self._account(name), peer.address, peer.is_own_screen)
 
-    def set_pin(self, pin: str, token: str | None) -> str:
-        """Set the PIN and log in; return the login token. Changing an existing PIN requires a valid token.
+    def sign_in(self, name: str, secret: str, peer: Peer) -> str:
+        """Begin a login and return its token; SecretWrong, SignInLockedOut, or SetupRequired before the first user."""
+        if not self.users.has_begun:
+            raise SetupRequired("no user exists yet")
+        return self.logins.begin(self._verified(name, secret, peer))
 
-        LoginRequired without that token, PinWrong if it is not 4 to 12 digits, StoreError if it cannot be written.
+    def confirm(self, token: str | None, secret: str, peer: Peer) -> None:
+        """Note that the user of a login has typed the secret again; SecretWrong or SignInLockedOut otherwise."""
+        self._verified(self._own_name(token), secret, peer)
+        self.logins.confirm(token)
+
+    def change_secret(self, token: str | None, secret: str, new: str, peer: Peer) -> str:
+        """Give the user of a login a new secret; return the token of the login that replaces all earlier ones."""
+        user = self._verified(self._own_name(token), secret, peer)
+        return self.logins.begin(self.users.change(user.name, secret=new))
+
+    def set_up(self, code: str, name: str, secret: str, peer: Peer) -> str:
+        """Create the first administrator, who has every role, and return the token of a login.
+
+        SecretWrong for a wrong code, RecordNotFound with a user, SignInLockedOut, InputError for name or secret.
         """
-        with self._lock:
-            if self.has_pin:
-                self._require_login(token)
-            if not (pin.isascii() and pin.isdecimal() and MIN_DIGITS <= len(pin) <= MAX_DIGITS):
-                raise PinWrong("this cannot be a PIN", f"Choose {MIN_DIGITS} to {MAX_DIGITS} digits.")
-            salt = secrets.token_bytes(16)
-            content = digested_json.encoded({"salt": salt.hex(), "hash": _hash(pin, salt).hex()})
-            try:
-                atomic_io.write_atomically(self._file, content)
-            except OSError as error:
-                raise StoreError(f"the PIN cannot be kept: {error}", "Free some space, then set it again.") from error
-            return self._issue_token()
+        with self._verifying:
+            if self.users.has_begun:
+                raise RecordNotFound("this device was set up already", "Sign in with your name and PIN.")
+            self._refuse_early(SETUP_ACCOUNT, peer)
+            if not self.users.is_setup_code(code):
+                self._lock_out.record_failure(SETUP_ACCOUNT, peer.address)
+                raise SecretWrong("this is not the set-up code", "Type the code that `diffuscope users list` shows.")
+            user = self.users.add(name, secret, DEMO_USER.roles | {"administrator"})
+        return self.logins.begin(user)
 
-    def log_in(self, pin: str) -> str:
-        """Log in with the PIN and return the login token.
+    def _own_name(self, token: str | None) -> str:
+        user = self.logins.user(token)
+        return "" if user is None else user.name
 
-        PinWrong for a wrong PIN, PinLockedOut during the lock-out (the PIN is not checked), LoginRequired before a PIN
-        is set, StoreDamaged if its file is damaged.
-        """
-        with self._lock:
-            if not self.has_pin:
-                raise LoginRequired("no PIN was set yet", "Choose a PIN first.")
-            if (wait_s := self.lock_out_s) > 0:
-                raise PinLockedOut(f"{self._wrong} wrong PINs in a row: wait {wait_s:.0f} s")
-            salt, known = self._read_hash()
-            if not hmac.compare_digest(_hash(pin, salt), known):
-                self._wrong += 1
-                self._not_before_s = self._clock.now_s() + min(2.0 ** (self._wrong - 1), MAX_LOCK_OUT_S)
-                raise PinWrong("this is not the PIN")
-            return self._issue_token()
+    def _verified(self, name: str, secret: str, peer: Peer) -> User:
+        with self._verifying:
+            account = self._account(name)
+            self._refuse_early(account, peer)
+            user = self.users.verify(name, secret)
+            if user is None:
+                self._lock_out.record_failure(account, peer.address)
+                raise SecretWrong("name and PIN do not belong together")
+            self._lock_out.record_success(account, peer.address)
+            return user
 
-    def log_out(self) -> None:
-        """Log out: invalidate the login token."""
-        with self._lock:
-            self._token = None
+    def _refuse_early(self, account: str, peer: Peer) -> None:
+        wait_s = self._lock_out.wait_s(account, peer.address, peer.is_own_screen)
+        if wait_s > 0:
+            raise SignInLockedOut(f"wrong several times: wait {wait_s:.0f} s", wait_s=round(wait_s, 1))
 
-    def require_login(self, token: str | None) -> None:
-        """Raise LoginRequired unless `token` is the valid login token."""
-        with self._lock:
-            self._require_login(token)
-
-    def is_logged_in(self, token: str | None) -> bool:
-        """Return whether `token` is the valid login token."""
-        try:
-            self.require_login(token)
-        except LoginRequired:
-            return False
-        return True
-
-    def renew_login(self, token: str | None) -> None:
-        """Check the token and restart the idle timeout; LoginRequired if the token is invalid.
-
-        Called for requests that act; requests that only read leave the timeout running.
-        """
-        with self._lock:
-            self._require_login(token)
-            self._touched_s = self._clock.now_s()
-
-    def _require_login(self, token: str | None) -> None:
-        if self._token is not None and self._clock.now_s() - self._touched_s >= IDLE_TIMEOUT_S:
-            self._token = None
-        if self._token is None or token is None or not hmac.compare_digest(token.encode(), self._token.encode()):
-            raise LoginRequired("the technician's place is locked")
-
-    def _issue_token(self) -> str:
-        self._wrong = 0
-        self._not_before_s = 0.0
-        self._token, self._touched_s = secrets.token_urlsafe(32), self._clock.now_s()
-        return self._token
-
-    def _read_hash(self) -> tuple[bytes, bytes]:
-        try:
-            stored = digested_json.decoded(self._file.read_bytes())
-            return bytes.fromhex(str(stored["salt"])), bytes.fromhex(str(stored["hash"]))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            message = f"the file with the technician's PIN is damaged: {error}"
-            raise StoreDamaged(message, f"Remove {self._file} and choose a new PIN.") from error
-
-
-def _hash(pin: str, salt: bytes) -> bytes:
-    return hashlib.scrypt(pin.encode("utf-8"), salt=salt, dklen=32, **SCRYPT_COST)
+    def _account(self, name: str) -> str:
+        """Return the account of the lock-out: a new secret begins a new one, all unknown names share one."""
+        user = self.users.find(name)
+        return UNKNOWN_ACCOUNT if user is None else f"{user.name} {user.generation}"

@@ -1,16 +1,12 @@
-"""Dependencies of endpoints: the control lease of a screen and the technician's login."""
+"""Dependencies of endpoints: the control lease of a screen."""
 
 from collections.abc import Awaitable, Callable
 from typing import Annotated
 
-from fastapi import Cookie, Header, Request
+from fastapi import Header, Request
 
-from services.http.authentication import PinAuthenticator
 from services.http.control_lease import ControlLease
 from services.http.security import SAFE_METHODS
-
-COOKIE = "technician"
-Token = Annotated[str | None, Cookie(alias=COOKIE)]
 
 
 def acquire_control_lease(lease: ControlLease) -> Callable[..., None]:
@@ -39,21 +35,3 @@ def acquire_lease_for_light(lease: ControlLease) -> Callable[..., Awaitable[None
         lease.acquire_for_light(x_controller)
 
     return acquire
-
-
-def login_required(authenticator: PinAuthenticator) -> Callable[..., None]:
-    """Return the dependency of endpoints that read: LoginRequired without a valid login."""
-
-    def logged_in(token: Token = None) -> None:
-        authenticator.require_login(token)
-
-    return logged_in
-
-
-def login_renewal(authenticator: PinAuthenticator) -> Callable[..., None]:
-    """Return the dependency of endpoints that act: LoginRequired without a valid login; restarts the idle timeout."""
-
-    def acting(token: Token = None) -> None:
-        authenticator.renew_login(token)
-
-    return acting

@@ -31,7 +31,8 @@ from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
 from services.health.event_log import EventLog
 from services.http.app import create_app
-from services.http.authentication import PinAuthenticator
+from services.http.authentication import OWN_SCREEN, Authenticator
+from services.http.client_limits import Client
 from services.http.connection_limits import ConnectionLimits, ConnectionTable, LimitedConfig, LimitedListener
 from services.http.log_rate import LOGGER_NAMES, LogRateLimit
 from services.http.routes.accuracy import accuracy_routes
@@ -39,6 +40,7 @@ from services.http.routes.backup import backup_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
+from services.identity.users import FOLDER
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
 from services.instrument.allocator import return_freed_arrays
 from services.instrument.events import EventBus
@@ -136,21 +138,29 @@ def serve(
         exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, programme)
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
         undo.callback(arbiter.close)
-        authenticator = PinAuthenticator(data / "technician.json", clock)
         backups = undo.enter_context(closing(BackupRunner(data, lambda: arbiter.is_idle, clock)))
         routers = [
             accuracy_routes(explorer, store, lambda: arbiter.exam.head.calibration),
-            update_routes(UpdateRequests(*updater, clock, version("diffuscope")), authenticator),
+            update_routes(UpdateRequests(*updater, clock, version("diffuscope"))),
             event_log_routes(event_log, UsbDrives(), clock),
             backup_routes(backups, store, UsbDrives(), clock),
         ]
+        authenticator = Authenticator(data / FOLDER, clock, has_demo=_has_demo(spec, address))
         names = own_host_names() + host_names
         app = create_app(arbiter, authenticator, programme, names, technician_routers=routers, uploader=uploader)
         _log_start(app.http.version, store)
+        if authenticator.user(None, OWN_SCREEN) is None and not authenticator.users.has_begun:
+            log.warning("no user exists yet: `diffuscope users list` with this data folder shows the set-up code")
         ready()
         stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _has_demo(spec: InstrumentSpec, address: socket.socket) -> bool:
+    """Return whether the demonstration user may exist: no real lamp or camera, and only this computer can connect."""
+    is_played = {spec.light.backend, spec.camera.backend} <= {"sim", "replay"}
+    return is_played and Client.at(str(address.getsockname()[0])).is_local
 
 
 def _with_own_numbers(programme: Programme, store: CaptureStore) -> Programme:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from threading import Lock
 
 from device.clock import Clock
-from services.errors import ConfirmationRequired, SignInRequired
+from services.errors import ConfirmationRequired, LoginRequired
 from services.identity.users import User, UserTable
 
 IDLE_LOCK_S = 300.0
@@ -59,10 +59,10 @@ class Logins:
         return user
 
     def require_confirmed(self, token: str | None) -> None:
-        """Raise ConfirmationRequired unless the secret was typed within `CONFIRMED_S`, SignInRequired if it ended."""
+        """Raise ConfirmationRequired unless the secret was typed within `CONFIRMED_S`, LoginRequired if it ended."""
         login = self._live(token)
         if login is None:
-            raise SignInRequired("the login has ended")
+            raise LoginRequired("the login has ended")
         if self._clock.now_s() - login.confirmed_s >= CONFIRMED_S:
             raise ConfirmationRequired("the PIN was typed too long ago")
 

@@ -32,7 +32,7 @@ from services.update.rauc import Release
 
 Version = tuple[int, ...]
 Answer = TypeVar("Answer", bound=BaseModel)
-EXAM_S = 1800.0
+EXAM_S = 600.0  # after the last picture
 # A Raspberry Pi 5 with the bootloader of 23 September 2024 hung in a tried version, with one of November it did not:
 # home-assistant/operating-system issue 3943.
 MIN_BOOTLOADER = datetime(2024, 11, 1, tzinfo=UTC)
@@ -44,22 +44,13 @@ KERNEL_REMEDY = "Get the update that the maker of the device made for cards: it 
 
 
 class ReportedState(BaseModel):
-    """Status as reported by the instrument; `state`: of the exam, None if the release does not report it."""
+    """Status as reported by the instrument.
+
+    `state`: of the exam, None if the release does not report it. `last_capture_at`: time of the newest picture, if any.
+    """
 
     state: str | None = None
-
-
-class ReportedVisit(BaseModel):
-    """Visit as reported by the instrument: its number, and when it was begun."""
-
-    number: str
-    begun_at: AwareDatetime
-
-
-class ReportedVisits(BaseModel):
-    """Open visits as reported by the instrument, the latest first."""
-
-    visits: tuple[ReportedVisit, ...] = ()
+    last_capture_at: AwareDatetime | None = None
 
 
 class ReportedCheck(BaseModel):
@@ -123,17 +114,17 @@ def refuse_while_in_use(at: str, lowest_battery: float, now: datetime) -> tuple[
     """Return the names of failing health checks, or refuse: UpdateDuringExam, UpdatePowerLow, UpdateCapturesAtRisk.
 
     `at`: base URL of the instrument; `lowest_battery`: least charge (0 to 1). UpdateDuringExam: the instrument is busy,
-    or an open visit was begun less than `EXAM_S` ago. An instrument that does not answer takes no pictures and may need
-    the update: the result is then empty. UpdateFailed for an answer of another form: exams and captures are unknown.
+    or took a picture less than `EXAM_S` ago; a visit without a picture delays nothing. An instrument that does not
+    answer takes no pictures and may need the update: the result is then empty. UpdateFailed for an answer of another
+    form: exams and captures are unknown.
     """
     status = _answer(at, "/api/status", ReportedState)
     if status is None:
         return ()
     if status.state in ("busy", "making"):
         raise UpdateDuringExam(f"the instrument is {status.state}")
-    for visit in (_answer(at, "/api/visits?open=true&limit=1", ReportedVisits) or ReportedVisits()).visits:
-        if abs(since_s := (now - visit.begun_at).total_seconds()) < EXAM_S:
-            raise UpdateDuringExam(f"visit {visit.number} is open, begun {since_s / 60:.0f} minutes ago")
+    if status.last_capture_at is not None and abs(since_s := (now - status.last_capture_at).total_seconds()) < EXAM_S:
+        raise UpdateDuringExam(f"the last picture was taken {since_s / 60:.0f} minutes ago")
     health = _answer(at, "/api/health", ReportedHealth) or ReportedHealth()
     if (battery := health.battery) is not None and is_battery_low(battery, lowest_battery):
         raise UpdatePowerLow(f"the battery is at {battery:.0%}, an update needs {lowest_battery:.0%}")

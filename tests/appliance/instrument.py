@@ -27,19 +27,17 @@ class Page:
     checks: list[Check] = field(default_factory=lambda: [check("camera"), check("captures")])
     sees: bool = True
     hangs: bool = False
-    visit_begun: timedelta | None = None  # age of the open visit; None: no open visit
+    pictured: timedelta | None = None  # age of the newest picture; None: no picture
     closing: Event = field(default_factory=Event)
 
     def answer(self, path: str) -> tuple[int, bytes]:
         match path:
             case "/api/status":
-                return 200, json.dumps({"state": self.state, "version": version("diffuscope")}).encode()
+                taken_at = None if self.pictured is None else (datetime.now(UTC) - self.pictured).isoformat()
+                status = {"state": self.state, "version": version("diffuscope"), "last_capture_at": taken_at}
+                return 200, json.dumps(status).encode()
             case "/api/health":
                 return 200, json.dumps({"battery": self.battery, "checks": as_json(self.checks)}).encode()
-            case "/api/visits?open=true&limit=1":
-                begun = [] if self.visit_begun is None else [datetime.now(UTC) - self.visit_begun]
-                visits = [{"number": "PN-0007-K", "begun_at": at.isoformat()} for at in begun]
-                return 200, json.dumps({"visits": visits}).encode()
         return (200, b"\xff\xd8a picture") if self.sees else (204, b"")
 
 

@@ -132,7 +132,7 @@ def blocking_page(exam: str = "aim", battery: float | None = None, well: bool = 
     [
         (blocking_page(exam="busy"), UpdateDuringExam),
         (blocking_page(exam="making"), UpdateDuringExam),
-        (Page(visit_begun=timedelta(minutes=3)), UpdateDuringExam),
+        (Page(pictured=timedelta(minutes=3)), UpdateDuringExam),
         (blocking_page(battery=0.49), UpdatePowerLow),
         (blocking_page(well=False), UpdateCapturesAtRisk),
     ],
@@ -140,12 +140,12 @@ def blocking_page(exam: str = "aim", battery: float | None = None, well: bool = 
 def test_update_is_refused_during_exam_low_battery_or_damaged_captures(
     bench: Bench, page: Page, two: tuple[object, Path], now: Page, kind: type[UpdateError]
 ) -> None:
-    page.state, page.battery, page.checks, page.visit_begun = now.state, now.battery, now.checks, now.visit_begun
+    page.state, page.battery, page.checks, page.pictured = now.state, now.battery, now.checks, now.pictured
     with pytest.raises(kind):
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "A"
     page.state, page.battery, page.checks = "aim", 0.51, [check("captures")]
-    page.visit_begun = timedelta(hours=1)  # an old unfinished visit is no examination
+    page.pictured = timedelta(hours=1)  # an old picture is no examination
     with bench.service():
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "B"

@@ -78,10 +78,8 @@ def wait_for_state(page: Page, state: str) -> None:
     page.wait_for_timeout(700)  # debounce of the page
 
 
-def log_in_again(page: Page) -> None:
-    """Log in again after a restart."""
-    page.wait_for_selector("[data-view=door]", timeout=120_000)
-    page.wait_for_timeout(700)
+def wait_for_restart(page: Page) -> None:
+    """Wait until the page has an answer of the restarted instrument."""
     log_in(page)
 
 
@@ -118,7 +116,7 @@ def test_update_from_usb_drive(device: Device, open_page: Open, complaints: Comp
     assert board.is_off
     assert board.boot() == "B"
     device.boot_version("2.0")
-    log_in_again(page)
+    wait_for_restart(page)
     wait_for_state(page, "trying")
     board.patience_s = 120  # a busy computer needs longer to become ready
     assert "is well, and committed" in board.run("settle", "2.0")
@@ -154,7 +152,7 @@ def test_unhealthy_version_is_rolled_back(device: Device, open_page: Open, compl
     assert "is not well" in board.run("settle", "3.0")
     assert board.boot() == board.chooser.committed()
     device.boot_version(before)
-    log_in_again(page)
+    wait_for_restart(page)
     wait_for_state(page, "went back")
     expect(page.locator(".update")).to_contain_text("The update did not work. The old version is running.")
     expect(page.locator(".update")).to_contain_text(f"Version {before} is running.")

@@ -28,8 +28,8 @@ from device.clock import VirtualClock
 from device.config.head_file import load_head
 from services.delivery.uploader import load_settings
 from services.delivery.visit_export import export_files, folder_name, zip_archive
-from services.errors import PinWrong, ReceiverUnreachable
-from services.http.authentication import PinAuthenticator
+from services.errors import ReceiverUnreachable
+from services.identity.users import UserTable
 from services.instrument.accuracy_explorer import AccuracyExplorer
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
@@ -50,7 +50,7 @@ SCHEMA = compare.RECORDS / "schema.sql"
 DAY_S = 86400.0
 NOON = datetime(2026, 3, 2, 12, tzinfo=UTC)
 LATER = NOON + timedelta(days=5)  # time of reading: no finish can be undone any more
-PIN = "2468"
+PIN = "274913"
 SETTINGS = 'address = "https://reader.example.org/inbox"\ntoken = "send.token"\nanswer_s = 12.5\n'
 NAMES = re.compile(r"\d{8}T\d{6}-(?:(?:OD|OS)-)?[0-9a-f]{6}")
 PATIENT = re.compile(r"\b(?!0{8})[0-9a-f]{16}\b")
@@ -103,7 +103,7 @@ def _make_data(folder: Path) -> None:
         AccuracyExplorer(
             rig.store.folder / "accuracy", Path(place), clock, spec, lambda *_, **__: None, measure_scene
         ).choose("quick")
-        PinAuthenticator(rig.store.folder / "technician.json", clock).set_pin(PIN, None)
+        UserTable(rig.store.folder / "access").add("Asha", PIN, ["administrator"])
         visit = next(
             candidate
             for candidate in rig.request("GET", "/api/visits").json()["visits"]
@@ -242,18 +242,15 @@ def _read_doses(store: CaptureStore) -> dict[str, float]:
 
 
 def _read_settings(folder: Path, clock: VirtualClock) -> dict[str, Any]:
-    door = PinAuthenticator(folder / "data" / "technician.json", clock)
-    try:
-        door.log_in(PIN[::-1])
-    except PinWrong as wrong:
-        refused = wrong.code
-    clock.sleep(10)
-    door.log_in(PIN)
+    users = UserTable(folder / "data" / "access")
+    signed_in = users.verify("Asha", PIN)
+    assert signed_in is not None
     spec = load_head(Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml")
     chosen = AccuracyExplorer(folder / "data" / "accuracy", folder, clock, spec, lambda *_, **__: None, measure_scene)
     send = load_settings(folder / "send.toml")
     return {
-        "wrong pin": refused,
+        "wrong pin": users.verify("Asha", PIN[::-1]),
+        "roles": sorted(signed_in.roles),
         "pace": chosen.pace,
         "budget_s": chosen.budget_s,
         "send": {"address": send.address, "token": str(send.token), "answer_s": send.answer_s, "most_s": send.most_s},

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from services.delivery.upload_worker import BACKOFF_FIRST_S
+from services.identity.users import UserTable
 from tests.golden import compare
 from tests.golden.instrument import Refusing, instrument, until
 from tests.golden.transcript import Transcript
@@ -13,7 +14,8 @@ Chapter = Callable[[], list[dict[str, Any]]]
 UNKNOWN_CAPTURE, UNKNOWN_VISIT = "20260101T000000-OD-ffffff", "20260101T000000-ffffff"
 RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, which measures in another thread
 LENSES = "/api/calibration/trial-lenses"
-PIN, STANDS = {"pin": "2580"}, ("cap", "screen", "point")
+ASHA, STANDS = {"name": "Asha", "secret": "274913"}, ("cap", "screen", "point")
+NO_USER: dict[str, Any] = {"note": "no user: sent through a proxy", "headers": {"X-Forwarded-For": "10.42.0.7"}}
 
 
 def captures() -> list[dict[str, Any]]:
@@ -211,19 +213,17 @@ def _backups(log: Transcript) -> None:
     removal = "/api/technician/removal"
     for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
         log.ask(operation)
-    log.ask("POST /api/technician/lock")
-    log.ask(f"GET {at}", note="no technician is logged in")
+    log.ask(f"GET {at}", **NO_USER)
     for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
-        log.ask(operation, note="no technician is logged in")
+        log.ask(operation, **NO_USER)
 
 
 def _event_log(log: Transcript) -> None:
     paths = ("/api/technician/event-log", "/api/technician/event-log.txt")
     for path in paths:
-        log.ask(f"GET {path}", note="no technician is logged in")
+        log.ask(f"GET {path}", **NO_USER)
     export = "POST /api/technician/event-log/export"
-    log.ask(export, json={"folder": log.instrument.stick_id}, note="no technician is logged in")
-    log.ask("POST /api/technician/pin", json=PIN)
+    log.ask(export, json={"folder": log.instrument.stick_id}, **NO_USER)
     for path in paths:
         log.ask(f"GET {path}")
     log.ask("GET /api/technician/event-log", "/api/technician/event-log?limit=0")
@@ -241,29 +241,46 @@ def _finished_visit(log: Transcript) -> str:
     return visit
 
 
-def technician() -> list[dict[str, Any]]:
-    """Record the PIN: first choice, wrong attempts with their lock-out, logging out, and the time-out."""
+def access() -> list[dict[str, Any]]:
+    """Record the set-up, wrong attempts with their lock-out, the users, signing out, and the idle lock."""
     with instrument(calibrated_before=False) as device:
-        log = Transcript(device)
-        log.ask("GET /api/technician")
-        log.ask("POST /api/technician/unlock", json=PIN, note="no PIN was ever set")
-        log.ask("POST /api/technician/pin", json={"pin": "12"})
-        log.ask("POST /api/technician/pin", json=PIN)
-        log.ask("GET /api/technician")
-        log.ask("POST /api/technician/here")
-        log.ask("POST /api/technician/lock")
-        log.ask("POST /api/technician/lock", note="no technician is logged in")
-        log.ask("POST /api/technician/here", note="no technician is logged in")
-        log.ask("POST /api/technician/pin", json={"pin": "1111"}, note="no technician is logged in, and there is a PIN")
-        log.ask("POST /api/technician/unlock", json={"pin": "1111"})
-        log.ask("POST /api/technician/unlock", json=PIN, note="too soon after a wrong PIN")
-        log.ask("POST /api/technician/unlock", json={"pin": "1" * 41})
+        log, users = Transcript(device), UserTable(device.folder / "access")
+        log.ask("GET /api/login", note="the demonstration user")
+        log.ask("POST /api/login", json=ASHA, note="no user exists yet")
+        log.ask("POST /api/setup", json=ASHA | {"code": "AAAAAAAA"})
         device.clock.elapsed_s += 2
-        log.ask("POST /api/technician/unlock", json=PIN)
+        log.ask("POST /api/setup", json=ASHA | {"code": users.setup_code(), "secret": "123456"})
+        log.ask("POST /api/setup", json=ASHA | {"code": users.setup_code()})
+        log.ask("GET /api/login")
+        _users(log)
+        log.ask("POST /api/login/activity")
+        log.ask("POST /api/login/confirm", json={"secret": "000000"})
+        device.clock.elapsed_s += 2
+        log.ask("POST /api/login/confirm", json={"secret": ASHA["secret"]})
+        log.ask("PUT /api/login/secret", json={"secret": ASHA["secret"], "new": "111111"})
+        log.ask("PUT /api/login/secret", json={"secret": ASHA["secret"], "new": "918274"})
+        log.ask("DELETE /api/login")
+        for operation in ("GET /api/visits", "GET /api/users", "POST /api/login/activity", "GET /api/preview"):
+            log.ask(operation, note="no user is signed in")
+        log.ask("POST /api/login", json=ASHA, note="the PIN before the change")
+        log.ask("POST /api/login", json=ASHA | {"secret": "918274"}, note="too soon after a wrong PIN")
+        device.clock.elapsed_s += 2
+        log.ask("POST /api/login", json=ASHA | {"secret": "918274"})
         device.clock.elapsed_s += 400
-        log.ask("POST /api/technician/here", note="after the time-out")
-        log.ask("GET /api/technician", note="after the time-out")
+        log.ask("GET /api/login", note="after the idle lock")
         return log.exchanges
+
+
+def _users(log: Transcript) -> None:
+    """Record the changes of users by an administrator."""
+    ravi = {"name": "Ravi", "secret": "274913", "roles": ["reader"]}
+    log.ask("GET /api/users")
+    log.ask("POST /api/users", json=ravi)
+    log.ask("POST /api/users", json=ravi, note="the name is used")
+    log.ask("PATCH /api/users/{name}", "/api/users/Ravi", json={"roles": ["screener", "reader"]})
+    log.ask("PATCH /api/users/{name}", "/api/users/Eve", json={"roles": ["screener"]})
+    log.ask("DELETE /api/users/{name}", "/api/users/Asha", note="the last administrator")
+    log.ask("DELETE /api/users/{name}", "/api/users/Ravi")
 
 
 def calibration() -> list[dict[str, Any]]:
@@ -274,12 +291,11 @@ def calibration() -> list[dict[str, Any]]:
         log.ask("POST /api/captures", json={"eye": "OD"}, note="without a calibration")
         locked = {"": {"by": "Eve"}, "/ready": {"stand": "cap"}, "/cancel": {}, "/use": {"id": "0" * 16}}
         for path, body in locked.items():
-            log.ask(f"POST /api/calibration{path}", json=body, note="no technician is logged in")
+            log.ask(f"POST /api/calibration{path}", json=body, **NO_USER)
         for path, body in {"": {}, "/ready": {"lens": 0}}.items():
-            log.ask(f"POST {LENSES}{path}", json=body, note="no technician is logged in")
+            log.ask(f"POST {LENSES}{path}", json=body, **NO_USER)
         for path in ("", "/preview"):
-            log.ask(f"GET /api/calibration{path}", note="no technician is logged in")
-        log.ask("POST /api/technician/pin", json=PIN)
+            log.ask(f"GET /api/calibration{path}", **NO_USER)
         log.ask("GET /api/calibration")
         log.ask("GET /api/calibration/preview", note="nothing is being calibrated")
         log.ask("GET /api/calibration/preview", "/api/calibration/preview?after=-1")
@@ -360,12 +376,11 @@ def updates() -> list[dict[str, Any]]:
             method, path = call.split(" ")
             log.ask(
                 f"{method} /api/update{path}",
-                note="no technician is logged in",
+                **NO_USER,
                 **({} if body is None else {"json": body}),
             )
-        log.ask("POST /api/update/install", json={"id": "0" * 16}, note="no technician is logged in")
-        log.ask("PUT /api/update/file", content=b"x", note="no technician is logged in")
-        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("POST /api/update/install", json={"id": "0" * 16}, **NO_USER)
+        log.ask("PUT /api/update/file", content=b"x", **NO_USER)
         log.ask("GET /api/update")
         device.board.bundle("two.raucb", padding_bytes=1000)
         device.board.bundle("foreign.raucb", signer="a stranger", padding_bytes=1000)
@@ -387,7 +402,6 @@ def tablets() -> list[dict[str, Any]]:
     """Record uploads from a tablet, an installed update that is tried later, and a computer without an updater."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
-        log.ask("POST /api/technician/pin", json=PIN)
         log.ask("PUT /api/update/file", content=b"no bundle")
         log.ask("PUT /api/update/file", content=b"", headers={"Content-Length": "0"})
         log.ask("PUT /api/update/file", content=b"half", headers={"Content-Length": "8"})
@@ -437,11 +451,10 @@ def accuracy() -> list[dict[str, Any]]:
         made = log.ask("POST /api/captures", json={"eye": "OD"})["id"]
         log.exchanges.clear()
         again, at = "GET /api/technician/captures/{id}/again.png", f"/api/technician/captures/{made}/again.png"
-        log.ask("GET /api/technician/accuracy", note="no technician is logged in")
-        log.ask("POST /api/technician/accuracy", note="no technician is logged in")
-        log.ask("PUT /api/technician/pace", json={"pace": "quick"}, note="no technician is logged in")
-        log.ask(again, f"{at}?method=gradient", note="no technician is logged in")
-        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("GET /api/technician/accuracy", **NO_USER)
+        log.ask("POST /api/technician/accuracy", **NO_USER)
+        log.ask("PUT /api/technician/pace", json={"pace": "quick"}, **NO_USER)
+        log.ask(again, f"{at}?method=gradient", **NO_USER)
         log.ask("GET /api/technician/accuracy")
         log.ask("GET /api/technician/accuracy.svg", note="nothing is measured")
         log.ask("PUT /api/technician/pace", json={"pace": "quick"})
@@ -479,7 +492,7 @@ def security() -> list[dict[str, Any]]:
 
 CHAPTERS: dict[str, Chapter] = {
     chapter.__name__: chapter
-    for chapter in (captures, visits, exports, technician, calibration, updates, tablets, uploads, accuracy, security)
+    for chapter in (captures, visits, exports, access, calibration, updates, tablets, uploads, accuracy, security)
 }
 
 

@@ -31,7 +31,7 @@ from services.delivery.usb_drives import UsbDrive, UsbDrives
 from services.errors import UploadRejected
 from services.health.event_log import EventLog
 from services.http.app import Application, create_app
-from services.http.authentication import PinAuthenticator
+from services.http.authentication import Authenticator
 from services.http.routes.accuracy import accuracy_routes
 from services.http.routes.backup import backup_routes
 from services.http.routes.event_log import event_log_routes
@@ -202,7 +202,7 @@ async def _followed(app: FastAPI, enough: Heard, after: int | None) -> list[dict
         "root_path": "",
         "headers": [(b"host", b"eye.local"), *last],
         "server": ("eye.local", 80),
-        "client": ("page", 1),
+        "client": ("127.0.0.1", 1),
     }
     await asyncio.wait_for(app(scope, receive, send), 60)
     return heard
@@ -238,7 +238,7 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
         owner, cameras, explorer = _owner(folder, spec, clock, store, undo)
         undo.callback(owner.close)
         sticks, board = _sticks(folder), Board.new(folder / "board")
-        door = PinAuthenticator(folder / "technician.json", clock)
+        door = Authenticator(folder / "access", clock, has_demo=True)
         event_log = EventLog(folder / "event-log")
         undo.callback(event_log.close)
         desk = UpdateRequests(board.state, board.requests, clock, "1.0")
@@ -246,7 +246,7 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
         undo.callback(backups.close)
         rooms = [
             accuracy_routes(explorer, store, lambda: owner.exam.head.calibration),
-            update_routes(desk, door),
+            update_routes(desk),
             event_log_routes(event_log, sticks, clock),
             backup_routes(backups, store, sticks, clock),
         ]

@@ -12,7 +12,8 @@ ALWAYS = {  # public operations without input: the only refusal is that of a for
     "GET /api/programme",
     "GET /api/exports",
     "GET /api/upload-queue",
-    "GET /api/technician",
+    "GET /api/login",
+    "DELETE /api/login",
 }
 
 

@@ -34,7 +34,7 @@ from device.values import Calibration, Colour, Psf
 from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrive, UsbDrives
 from services.http.app import Application, create_app
-from services.http.authentication import PinAuthenticator
+from services.http.authentication import Authenticator
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter
@@ -80,7 +80,7 @@ class Rig:
     event_bus: EventBus
     exam: ExamService
     arbiter: HeadArbiter
-    authenticator: PinAuthenticator
+    authenticator: Authenticator
     build_application: Callable[[], Application]
     died: Event = field(default_factory=Event)
 
@@ -233,7 +233,7 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
             opened.spec, Archive(folder / "archive"), records, event_bus, clock, Watchdog(watchdog), died.set
         )
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
-        door = PinAuthenticator(folder / "technician.json", clock)
+        door = Authenticator(folder / "access", clock, has_demo=True)
         build_app = partial(create_app, owner, door, programme, uploader=carrier, usb_drives=sticks)
         clock.world = scene
         return Rig(scene, clock, records, event_bus, exam, owner, door, build_app, died)
@@ -290,15 +290,8 @@ def drives(tmp_path: Path, stick: Path) -> UsbDrives:
 
 
 def technician_requests(rig: Rig, path: str) -> Callable[..., httpx.Response]:
-    """Set the PIN, and return a function for requests below `path`, with a login for each, because it expires."""
-    rig.request("POST", "/api/technician/pin", json={"pin": "2580"})
-
-    def request(method: str, below: str = "", **more: Any) -> httpx.Response:
-        entered = rig.request("POST", "/api/technician/unlock", json={"pin": "2580"})
-        cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
-        return rig.request(method, f"{path}{below}", headers=cookie, **more)
-
-    return request
+    """Return a function for requests below `path`."""
+    return lambda method, below="", **more: rig.request(method, f"{path}{below}", **more)
 
 
 def until(holds: Callable[[], bool], patience_s: float = 60.0) -> None:
@@ -353,7 +346,7 @@ async def read_event_stream(
         "root_path": "",
         "headers": [(key.lower().encode(), value.encode()) for key, value in (headers or {}).items()],
         "server": ("eye", 80),
-        "client": ("page", 1),
+        "client": ("127.0.0.1", 1),
     }
     await asyncio.wait_for(app(scope, receive, send), 20)
     return received

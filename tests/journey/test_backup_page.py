@@ -101,12 +101,3 @@ def test_what_prevents_a_backup_is_in_the_state(ask: Ask, rig: Rig, stick: Path,
     objects.write_text("a file where a folder was")
     ask("POST", json={"folder": drive_id(stick)})
     assert ended(ask)["error"]["code"] == "stick.gone"
-
-
-def test_backups_need_the_login(rig: Rig, ask: Ask) -> None:
-    for method, path, body in (
-        ("GET", "", None),
-        ("POST", "", {"folder": "/"}),
-        ("POST", "/passphrase", {"passphrase": PASSPHRASE}),
-    ):
-        assert rig.request(method, f"/api/technician/backup{path}", json=body).status_code == 401

@@ -22,7 +22,7 @@ from device.head import Bench, open_bench, open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.sim.simulated_calibration import simulated_calibration
 from services.http.app import create_app
-from services.http.authentication import IDLE_TIMEOUT_S, PinAuthenticator
+from services.http.authentication import Authenticator
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
@@ -87,9 +87,6 @@ class Station:
         state: dict[str, Any] = self.ask("GET", "/api/calibration").json()
         return state
 
-    def set_pin(self) -> None:
-        self.post("/api/technician/pin", {"pin": "1234"})
-
     def start(self) -> None:
         until(lambda: self.state()["state"] in ("idle", "begin"))
         self.post("/api/calibration", {"by": "Ada"})
@@ -151,7 +148,7 @@ def make_station(tmp_path: Path, plans: Path) -> Iterator[MakeStation]:
 
             owner = HeadArbiter(context, exam, bench)
             undo.callback(owner.close)
-            app = create_app(owner, PinAuthenticator(tmp_path / "technician.json", clock)).http
+            app = create_app(owner, Authenticator(tmp_path / "access", clock, has_demo=True)).http
             return Station(owner, app, clock, benches, died)
 
         yield made
@@ -159,57 +156,7 @@ def make_station(tmp_path: Path, plans: Path) -> Iterator[MakeStation]:
 
 @pytest.fixture
 def station(make_station: MakeStation) -> Station:
-    station = make_station()
-    station.set_pin()
-    return station
-
-
-PROTECTED = [
-    ("GET", "/api/calibration"),
-    ("POST", "/api/calibration"),
-    ("POST", "/api/calibration/ready"),
-    ("POST", "/api/calibration/cancel"),
-    ("POST", "/api/calibration/use"),
-    ("GET", "/api/calibration/preview"),
-    ("POST", "/api/calibration/trial-lenses"),
-    ("POST", "/api/calibration/trial-lenses/ready"),
-    ("POST", "/api/technician/lock"),
-    ("POST", "/api/technician/here"),
-]
-
-
-def test_technician_endpoints_require_the_pin_and_captures_do_not(make_station: MakeStation) -> None:
-    station = make_station()
-
-    def all_locked() -> None:
-        for method, path in PROTECTED:
-            body = {"by": "Eve", "stand": "cap", "id": "0" * 16, "lens": 0} if method == "POST" else None
-            answer = station.ask(method, path, body)
-            assert (answer.status_code, answer.json()["code"]) == (401, "technician.locked"), path
-
-    all_locked()
-    assert station.ask("GET", "/api/technician").json()["has_pin"] is False
-    station.set_pin()
-    assert station.ask("GET", "/api/technician").json()["open"] is True
-    assert station.state()["kept"] == []
-    station.clock.sleep(IDLE_TIMEOUT_S)
-    all_locked()
-    assert station.refused("/api/technician/unlock", {"pin": "4321"}) == (403, "technician.pin")
-    assert station.refused("/api/technician/unlock", {"pin": "1234"}) == (429, "technician.wait")
-    station.clock.sleep(1)
-    station.post("/api/technician/unlock", {"pin": "1234"})
-    station.post("/api/technician/lock")
-    all_locked()
-    assert station.ask("POST", "/api/captures", {"eye": "OD"}).status_code == 201
-
-
-def test_the_session_cookie_is_httponly_and_samesite_strict(make_station: MakeStation) -> None:
-    station = make_station()
-    cookie = station.ask("POST", "/api/technician/pin", {"pin": "1234"}).headers["set-cookie"].lower()
-    assert "httponly" in cookie
-    assert "samesite=strict" in cookie
-    assert "expires" not in cookie
-    assert "max-age" not in cookie
+    return make_station()
 
 
 def test_a_complete_calibration_with_a_fault_at_every_step(station: Station) -> None:
@@ -299,7 +246,6 @@ def test_a_stopped_calibration_changes_nothing_and_its_steps_are_resumed(station
 
 def test_rollback_to_an_earlier_calibration_and_from_a_damaged_one(make_station: MakeStation, tmp_path: Path) -> None:
     station = make_station(TINY + FLAWS + CHIPS, archive=True)
-    station.set_pin()
     first, second = station.calibrate(), station.calibrate()
     assert first != second
     assert [calibration["id"] for calibration in station.state()["kept"]] == [second, first]
@@ -318,7 +264,6 @@ def test_rollback_to_an_earlier_calibration_and_from_a_damaged_one(make_station:
     (tmp_path / "archive" / first / "psf0.npy").write_bytes(b"not what was kept")
     reopened = make_station(archive=True)
     assert reopened.refused("/api/captures", {"eye": "OD"}) == (423, "calibration.damaged")
-    reopened.post("/api/technician/unlock", {"pin": "1234"})
     state = reopened.state()
     assert state["needed"]["code"] == "calibration.damaged"
     assert {calibration["id"]: calibration["damaged"] is None for calibration in state["kept"]} == {
@@ -337,7 +282,6 @@ def test_without_a_calibration_the_page_is_served_and_a_session_waits(make_stati
     assert station.ask("GET", "/technician").status_code == 200
     assert station.ask("GET", "/api/status").json()["problem"]["code"] == "calibration.missing"
     assert station.refused("/api/captures", {"eye": "OD"}) == (423, "calibration.missing")
-    station.set_pin()
     state = station.state()
     assert state["state"] == "begin"
     assert state["needed"]["code"] == "calibration.missing"
@@ -355,7 +299,6 @@ def test_a_stale_calibration_is_refused_until_a_new_one_is_measured(make_station
     old = [True]
     station = make_station(stale=lambda: old[0])
     assert station.refused("/api/captures", {"eye": "OD"}) == (423, "calibration.stale")
-    station.set_pin()
     assert station.state()["needed"]["message"] == "the point has moved by 3 pixels"
     old[0] = False
     station.calibrate()
@@ -422,28 +365,21 @@ def lasting(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         head = open_head(spec, clock, MemoryLedger(clock))
         exam = ExamService(head, store, context.event_bus, clock, plans, context.on_failure, Watchdog(None), *ALONE)
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(spec, clock))
-        station = Station(owner, create_app(owner, PinAuthenticator(folder / "pin.json", clock)).http, clock, [])
-        station.set_pin()
-        yield station
+        app = create_app(owner, Authenticator(folder / "access", clock, has_demo=True)).http
+        yield Station(owner, app, clock, [])
         owner.close()
 
 
 def test_a_bench_that_cannot_be_opened_returns_the_head_to_the_exam(make_station: MakeStation) -> None:
     station = make_station()
-    station.set_pin()
 
     def broken() -> Bench:
         raise CameraMissing("the simulated camera does not answer")
 
     until(lambda: station.state()["state"] == "idle")
     owner = HeadArbiter(station.owner.context, lambda: station.owner.exam, broken)
-    other = Station(
-        owner,
-        create_app(owner, PinAuthenticator(station.owner.context.store.folder / "pin.json", station.clock)).http,
-        station.clock,
-        [],
-    )
-    other.set_pin()
+    authenticator = Authenticator(station.owner.context.store.folder / "access", station.clock, has_demo=True)
+    other = Station(owner, create_app(owner, authenticator).http, station.clock, [])
     other.post("/api/calibration", {"by": "Ada"})
     until(lambda: other.state()["error"] is not None)
     assert other.state()["error"]["code"] == "camera.missing"
@@ -477,9 +413,7 @@ def calibrated(make_station: MakeStation, tmp_path: Path) -> Station:
     (tmp_path / "head.toml").write_text(TINY)
     of = world(load_head(tmp_path / "head.toml"))
     Archive(tmp_path / "archive").add_and_activate(simulated_calibration(of), WHO)
-    station = make_station(TINY, archive=True)
-    station.set_pin()
-    return station
+    return make_station(TINY, archive=True)
 
 
 def test_a_head_outside_its_limits_shows_readings_and_findings_and_keeps_its_calibration(calibrated: Station) -> None:
@@ -523,7 +457,6 @@ def test_a_cancelled_run_returns_the_head_to_the_exam(calibrated: Station) -> No
 
 def test_without_a_calibration_in_force_no_lens_is_measured(make_station: MakeStation) -> None:
     station = make_station(archive=True)
-    station.set_pin()
     assert station.refused(LENSES) == (423, "calibration.missing")
     assert station.state()["state"] == "begin"
 

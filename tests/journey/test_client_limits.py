@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 
 from services.http.app import create_app
+from services.http.authentication import OWN_SCREEN
 from services.http.client_limits import ClientLimits
 from services.http.connection_limits import ConnectionLimits
 from tests.journey.conftest import Rig, until
@@ -47,11 +48,13 @@ def test_more_event_streams_than_permitted_are_refused_until_one_ends(rig: Rig) 
 def test_remote_clients_do_not_take_the_live_picture_from_a_local_one(rig: Rig) -> None:
     """One wait for each remote address and two for all of them; the waits of the device's own screen are its own."""
     rig.block_exposures()
+    rig.authenticator.users.add("Asha", "274913", ["administrator", "technician"])
+    own = {"Cookie": f"login={rig.authenticator.sign_in('Asha', '274913', OWN_SCREEN)}"}
     app = create_app(rig.arbiter, rig.authenticator, preview_limits=TWO_LOCAL).http
 
     async def preview_statuses(*hosts: str) -> list[int]:
         clients = [client_of(app, host) for host in hosts]
-        waits = [asyncio.create_task(client.get("/api/preview?after=0")) for client in clients]
+        waits = [asyncio.create_task(client.get("/api/preview?after=0", headers=own)) for client in clients]
         answers = await asyncio.gather(*waits)
         return [answer.status_code for answer in answers]
 

@@ -22,7 +22,6 @@ PAGE_CODES = {
     "link.cut": "no answer came",
     "link.lost": "the event stream is silent",
     "link.slow": "the live picture is old",
-    "pin.short": "the PIN as typed is too short",
     "power.lost": "interrupted captures in the status",
     "shot.crossed": "both eyes were probably exchanged",
     "shot.lost": "the answer to a press is missing",

@@ -19,8 +19,9 @@ from services.backup.backup_key import key_for_recipients
 from services.backup.write_backup import write_backup
 from services.delivery.usb_drives import copy_to_drive
 from services.health.event_log import EventLog
-from services.http.authentication import PinAuthenticator
+from services.identity.lock_out import LockOut
 from services.identity.provision import load_or_create_identity
+from services.identity.users import UserTable
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
@@ -59,7 +60,8 @@ def test_a_data_folder_is_private_with_any_umask(umask: int, tmp_path: Path) -> 
         DoseLedgerStore(store.engine, clock, 86_400.0, "boot")
         CaptureJournal(store).begin(InterruptedCapture("d", "OD"))
         Snapshots(data / "store.sqlite", clock).create("s0001")
-        PinAuthenticator(data / "technician.json", clock).set_pin("1234", None)
+        UserTable(data / "access").add("Asha", "274913", ["administrator"])
+        LockOut(data / "access", clock).record_failure("Asha", "10.0.0.7")
         log = EventLog(data / "event-log")
         getLogger("services").info("an entry")
         log.close()

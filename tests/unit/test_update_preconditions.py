@@ -1,6 +1,6 @@
 """Preconditions of an update for valid, empty and malformed answers of the instrument, and for other forms."""
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
@@ -21,11 +21,11 @@ from tests.updates import Board
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
 NO_JSON = [b"", b"not JSON", b'{"visits": [', b"\xff\xfe\xfd"]
 NO_OBJECT = [b"5", b"null", b"true", b"[1, 2]", b"[[]]", b"[{}]", b'"busy"']
-VISIT, CHECK = b'{"number": "PN-0007-K", "begun_at": "2026-11-20T11:50:00Z"}', b'{"name": "captures", "ok": false}'
+CHECK = b'{"name": "captures", "ok": false}'
 
 
 def failed_checks(**bodies: bytes | None) -> tuple[str, ...]:
-    """Return the failing checks of an instrument with these bodies of status, visits and health; None: error 500."""
+    """Return the failing checks of an instrument with these bodies of status and health; None: error 500."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -47,20 +47,28 @@ def failed_checks(**bodies: bytes | None) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("body", [None, *NO_JSON])
 def test_an_instrument_without_a_valid_status_counts_as_unreachable(body: bytes | None) -> None:
-    """It takes no pictures, so nothing else is read: the visit and the failed check do not count."""
-    assert failed_checks(status=body, visits=b'{"visits": [%s]}' % VISIT, health=b'{"battery": 0.1}') == ()
+    """It takes no pictures, so nothing else is read: the battery does not count."""
+    assert failed_checks(status=body, health=b'{"battery": 0.1}') == ()
 
 
 @pytest.mark.parametrize("body", [None, *NO_JSON, b"[]", b"{}"])
-@pytest.mark.parametrize("name", ["visits", "health"])
-def test_an_answer_that_is_missing_malformed_or_empty_has_no_entries(name: str, body: bytes | None) -> None:
-    assert failed_checks(**{name: body}) == ()
+def test_an_answer_that_is_missing_malformed_or_empty_has_no_entries(body: bytes | None) -> None:
+    assert failed_checks(health=body) == ()
+
+
+@pytest.mark.parametrize(("minutes", "refused"), [(0, True), (9, True), (-9, True), (10, False), (-10, False)])
+def test_a_picture_of_the_last_ten_minutes_refuses_by_any_clock(minutes: int, refused: bool) -> None:
+    taken_at = (NOW - timedelta(minutes=minutes)).isoformat()
+    status = f'{{"state": "aim", "last_capture_at": "{taken_at}"}}'.encode()
+    if not refused:
+        assert failed_checks(status=status) == ()
+        return
+    with pytest.raises(UpdateDuringExam, match=f"taken {minutes} minutes ago"):
+        failed_checks(status=status)
 
 
 @pytest.mark.parametrize("status", [b"[]", b"{}", b'{"state": null}', b'{"state": "aim"}'])
-def test_visits_battery_and_checks_count_whether_or_not_the_status_names_a_state(status: bytes) -> None:
-    with pytest.raises(UpdateDuringExam, match="visit PN-0007-K is open, begun 10 minutes ago"):
-        failed_checks(status=status, visits=b'{"visits": [%s]}' % VISIT)
+def test_battery_and_checks_count_whether_or_not_the_status_names_a_state(status: bytes) -> None:
     with pytest.raises(UpdatePowerLow):
         failed_checks(status=status, health=b'{"battery": 0.49}')
     with pytest.raises(UpdateCapturesAtRisk, match="unreadable"):
@@ -72,15 +80,10 @@ def test_visits_battery_and_checks_count_whether_or_not_the_status_names_a_state
 @pytest.mark.parametrize(
     ("name", "body"),
     [
-        *[(name, body) for name in ("status", "visits", "health") for body in NO_OBJECT],
+        *[(name, body) for name in ("status", "health") for body in NO_OBJECT],
         ("status", b'{"state": 5}'),
-        ("visits", b'{"visits": 5}'),
-        ("visits", b'{"visits": null}'),
-        ("visits", b'{"visits": [5]}'),
-        ("visits", b'{"visits": [{"number": "PN-0007-K"}]}'),
-        ("visits", b'{"visits": [{"begun_at": "2026-11-20T11:50:00Z"}]}'),
-        ("visits", b'{"visits": [{"number": "PN-0007-K", "begun_at": "yesterday"}]}'),
-        ("visits", b'{"visits": [{"number": "PN-0007-K", "begun_at": "2026-11-20T11:50:00"}]}'),
+        ("status", b'{"last_capture_at": "yesterday"}'),
+        ("status", b'{"last_capture_at": "2026-11-20T11:50:00"}'),
         ("health", b'{"battery": "half"}'),
         ("health", b'{"checks": {"name": "heat"}}'),
         ("health", b'{"checks": [%s]}' % CHECK),

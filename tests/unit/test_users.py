@@ -8,7 +8,7 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import InputError
 from services import cli
-from services.errors import ConfirmationRequired, RecordNotFound, SignInRequired, StoreDamaged
+from services.errors import ConfirmationRequired, LoginRequired, RecordNotFound, StoreDamaged
 from services.identity.lock_out import MAX_OWN_SCREEN_WAIT_S, MAX_WAIT_S, LockOut
 from services.identity.logins import CONFIRMED_S, IDLE_LOCK_S, MAX_LOGIN_S, Logins
 from services.identity.users import UserTable
@@ -176,7 +176,7 @@ def test_a_risk_needs_the_secret_of_the_last_minutes(users: UserTable, clock: Vi
     logins.confirm(token)
     logins.require_confirmed(token)
     logins.end(token)
-    with pytest.raises(SignInRequired):
+    with pytest.raises(LoginRequired):
         logins.require_confirmed(token)
 
 

@@ -1,6 +1,7 @@
 // API client: JSON requests, event stream (server-sent events) and preview frames. Restricted to interfaces that work
 // without HTTPS: no service worker, no crypto.randomUUID, no web locks.
 
+import { askIfRequired } from "./login.js";
 import { t } from "../i18n/translate.js";
 
 /** Error answer of the server: code, message and remedy; "link.cut" when no answer came. */
@@ -49,7 +50,10 @@ async function requestJson(path, options = {}) {
   }
   const body = await response.json().catch(() => null);
   if (response.ok && body) return body;
-  if (body?.message) throw new ApiError(body);
+  if (body?.message) {
+    askIfRequired(body);
+    throw new ApiError(body);
+  }
   throw new ApiError({ code: `http.${response.status}`, message: t("fault.unknown"), remedy: t("fault.unknown.remedy") });
 }
 
@@ -124,7 +128,11 @@ export async function getPreview(after, eye, visit, signal) {
   const query = new URLSearchParams({ after, eye, visit });
   const response = await fetch(`/api/preview?${query}`, { cache: "no-store", headers, signal });
   if (response.status === 204) return null;
-  if (!response.ok) throw new ApiError((await response.json().catch(() => null)) ?? { code: `http.${response.status}` });
+  if (!response.ok) {
+    const answer = (await response.json().catch(() => null)) ?? { code: `http.${response.status}` };
+    askIfRequired(answer);
+    throw new ApiError(answer);
+  }
   return {
     number: Number(response.headers.get("X-Frame")),
     ageMs: Number(response.headers.get("X-Age-Ms")),

@@ -63,7 +63,7 @@ const settings = Object.freeze({
  * @typedef {{code: string, level: string, rank: number, buttons: string[], from: string, until: number, [more: string]: any}} Alert
  * @typedef {{id: string, eye: string, field: string, required: boolean}} SlotPlan
  * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, referral: Record<string, any>, numbers: Record<string, any>}} Programme
- * @typedef {{link: string, status: any, activity: string, hasControl: boolean, alerts: readonly Alert[],
+ * @typedef {{link: string, status: any, user: {name: string, roles: string[], is_demo: boolean} | null, activity: string, hasControl: boolean, alerts: readonly Alert[],
  *   route: import("./router.js").Route, programme: Programme | null, visit: Visit | null, visits: Visit[] | null,
  *   counts: {done: number, to_finish: number, referred: number, declined: number} | null, typed: string, listFilter: string,
  *   captures: readonly Capture[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
@@ -79,6 +79,7 @@ const settings = Object.freeze({
 export const store = createStore(/** @type {State} */ ({
   link: "opening", // opening | live | lost
   status: null,
+  user: null, // the signed-in user: {name, roles, is_demo}
   activity: "aim", // state of the instrument, as in its status
   hasControl: false, // this page holds the control lease, which live pictures need; another page can take it
   alerts: Object.freeze([]), // active alerts, see alerts.js

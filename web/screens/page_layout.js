@@ -38,7 +38,7 @@ export function page(state, actions) {
           : html`${screen}
               <div class="messages"><div role="status">${standing(state, actions)}</div> ${chips(state, actions)}</div>`}
       </main>
-      ${menu(state, actions)} ${modules.speech?.speechDialog(state) ?? nothing}
+      ${menu(state, actions)} <user-login></user-login> ${modules.speech?.speechDialog(state) ?? nothing}
     </div>
   `;
 }
@@ -106,7 +106,7 @@ function kindChip(kind) {
 // ---- menu
 
 /** @param {State} state */
-function menu({ theme, letters, auto, sound, status }, actions) {
+function menu({ theme, letters, auto, sound, status, user }, actions) {
   return html`
     <dialog id="menu" aria-labelledby="menu-title">
       <h2 id="menu-title">${t("menu")}</h2>
@@ -129,6 +129,8 @@ function menu({ theme, letters, auto, sound, status }, actions) {
           )}
         </dl>
       </details>
+      ${user ? html`<p>${t(user.is_demo ? "login.demo" : "login.as", { name: user.name })}</p>` : nothing}
+      ${user && !user.is_demo ? html`<button type="button" id="lock" @click=${actions.lock}>${t("login.lock")}</button>` : nothing}
       <a class="button" href="/technician">${t("menu.technician")}</a>
       <p class="muted">${t("app.name")} · ${status ? t("menu.version", { version: status.version }) : ""}</p>
       <button class="primary" type="button" @click=${actions.closeMenu}>${t("menu.close")}</button>

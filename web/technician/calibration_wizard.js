@@ -1,4 +1,4 @@
-// Templates of the technician page: login, calibration overview, calibration wizard; no requests, no logic.
+// Templates of the technician page: calibration overview, calibration wizard; no requests, no logic.
 
 import { drawing } from "./calibration_drawings.js";
 import { navigation } from "./nav.js";
@@ -31,13 +31,13 @@ export function technicianPage(state, actions) {
     <div class="place" data-view=${state.view} data-state=${state.cal?.state ?? "none"}>
       ${header(state, actions)}
       <main>${views[state.view](state, actions)}</main>
+      <user-login></user-login>
     </div>
   `;
 }
 
 const views = {
   opening: () => prompt("wait", t("tech.opening")),
-  door: (state, actions) => loginForm(state, actions),
   overview: (state, actions) => navigation(state, actions, overview),
   wizard: (state, actions) => wizard(state, actions),
   done: (state, actions) => done(state, actions),
@@ -54,7 +54,7 @@ function header({ cal, theme, view, lost }, actions) {
       ${cal && cal.kind !== "real" ? html`<p class="chip">${t(`chip.${cal.kind}`)}</p>` : nothing}
       <a class="button" href="/">${t("tech.pictures")}</a>
       <button type="button" @click=${() => actions.setTheme(other)}>${t(`tech.theme.${other}`)}</button>
-      ${view === "door" || view === "opening"
+      ${view === "opening"
         ? nothing
         : html`<button type="button" id="lock" @click=${actions.lock}>${t("tech.lock")}</button>`}
       ${lost ? html`<p class="lost" role="alert">${icon("warn")} ${t("tech.lost")}</p>` : nothing}
@@ -62,35 +62,11 @@ function header({ cal, theme, view, lost }, actions) {
   `;
 }
 
-// ---- login
-
-function loginForm({ hasPin, pin, wait, error, busy }, actions) {
-  const key = (digit) => html`<button type="button" @click=${() => actions.digit(digit)}>${digit}</button>`;
-  const word = wait > 0 ? t("pin.wait", { count: Math.ceil(wait) }) : t(hasPin ? "pin.open" : "pin.set");
-  return html`
-    <form class="door card" @submit=${actions.enter}>
-      <h2>${t(hasPin ? "pin.give" : "pin.choose")}</h2>
-      ${prompt("plain", t(hasPin ? "pin.give.why" : "pin.choose.why"))} ${errorBox(error)}
-      <label class="field">${t("pin.label")}
-        <input
-          id="pin" type="password" inputmode="none" autocomplete="off" maxlength="12"
-          .value=${pin} @input=${actions.pinTyped}
-        />
-      </label>
-      <div class="keys" data-repeat>
-        ${[1, 2, 3, 4, 5, 6, 7, 8, 9].map(key)}
-        <button type="button" class="wide" @click=${actions.deleteDigit}>${t("pin.delete")}</button>
-        ${key(0)}
-      </div>
-      <button class="primary big" id="enter" type="submit" aria-disabled=${wait > 0 || busy}>${word}</button>
-    </form>
-  `;
-}
-
 // ---- overview: calibration in use, start, restore an earlier one
 
 function overview(state, actions) {
   const { cal, by, error, busy } = state;
+  if (!cal) return errorBox(error);
   const ready = cal.state !== "starting";
   return html`
     <section class="column" aria-label=${t("cal.title")}>

@@ -6,6 +6,7 @@ import "./backup.js";
 import "./health.js";
 import "./software_update.js";
 import "./stored_pictures.js";
+import "./users.js";
 import { html } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
 
@@ -16,6 +17,7 @@ const SECTIONS = {
   "event-log": html`<instrument-event-log class="column"></instrument-event-log>`,
   backup: html`<instrument-backup class="column"></instrument-backup>`,
   space: html`<stored-pictures class="column"></stored-pictures>`,
+  users: html`<instrument-users class="column"></instrument-users>`,
   update: html`<software-update class="column"></software-update>`,
 };
 

@@ -1,7 +1,9 @@
-// Controller of the technician page: PIN login, calibration, trial lenses. The state of a calibration is polled from the server,
+// Controller of the technician page: calibration, trial lenses. The state of a calibration is polled from the server,
 // so a reload or restart loses nothing.
 
 import { ApiError } from "../core/api.js";
+import "../components/user_login.js";
+import { askIfRequired, lock, reportActivity } from "../core/login.js";
 import "./sensor_preview.js";
 import { createStore } from "../core/store.js";
 import { buttonsChanged } from "../core/taps.js";
@@ -10,17 +12,13 @@ import { technicianPage } from "./calibration_wizard.js";
 import { loadLanguage, t } from "../i18n/translate.js";
 
 const POLL_MS = 700;
-const ACTIVITY_MS = 30_000; // at most one activity report in this time
 
 await loadLanguage("en", "technician/en");
 
 const store = createStore(/** @type {Record<string, any>} */ ({
-  view: "opening", // opening | door | overview | wizard | done | lenses | lens-result
+  view: "opening", // opening | overview | wizard | done | lenses | lens-result
   section: "calibration", // section of the overview
   cal: null, // latest calibration state of the server
-  hasPin: true,
-  pin: "",
-  wait: 0, // lock-out: seconds until the next PIN attempt
   by: loadSetting("technician", ""),
   levels: null,
   mishap: "",
@@ -30,7 +28,6 @@ const store = createStore(/** @type {Record<string, any>} */ ({
   theme: loadSetting("theme", "dim"),
 }));
 const { get, set } = store;
-let activityMs = 0;
 let dismissed = readStorage("dismissed");
 let dismissedLenses = readStorage("dismissed.lenses");
 
@@ -64,16 +61,12 @@ async function poll() {
 
 async function refresh() {
   try {
-    if (get().view === "door") return set({ wait: Math.max(0, get().wait - POLL_MS / 1000) });
-    if (get().view === "opening") {
-      const { open } = await request("/api/technician");
-      if (!open) return showLogin();
-    }
     showCalibration(await request("/api/calibration"));
     set({ lost: false });
   } catch (problem) {
-    if (problem.code === "technician.locked") await showLogin();
-    else if (problem.code === "link.cut") set({ lost: true });
+    if (problem.code === "link.cut") set({ lost: true });
+    else if (problem.code === "access.role") set({ view: "overview", cal: null, error: problem, lost: false });
+    else if (askIfRequired(problem)) set({ view: "opening", lost: false });
     else throw problem;
   }
   return undefined;
@@ -97,20 +90,6 @@ function viewOf({ state, made, lenses }) {
 
 const stepOf = (cal) => [cal?.state, cal?.stand, cal?.lenses?.state, cal?.lenses?.lens].join();
 
-async function loginState() {
-  const { has_pin: hasPin, wait_s: wait } = await request("/api/technician");
-  return { hasPin, wait, pin: "" };
-}
-
-async function showLogin() {
-  try {
-    set({ view: "door", ...(await loginState()), error: null, lost: false, busy: false });
-  } catch (problem) {
-    if (!(problem instanceof ApiError)) throw problem;
-    set({ lost: true });
-  }
-}
-
 // Send one request per tap; show the server's error.
 async function submit(path, body, then = showCalibration) {
   if (get().busy) return;
@@ -119,11 +98,7 @@ async function submit(path, body, then = showCalibration) {
     then(await request(path, body));
   } catch (problem) {
     if (!(problem instanceof ApiError)) throw problem;
-    if (problem.code === "technician.locked" && get().view !== "door") await showLogin();
-    else {
-      const wait = get().view === "door" ? await loginState().catch(() => null) : null; // the lock-out time is known before the next tap
-      set({ ...wait, error: { code: problem.code, message: problem.message, remedy: problem.remedy } });
-    }
+    if (!askIfRequired(problem)) set({ error: { code: problem.code, message: problem.message, remedy: problem.remedy } });
   } finally {
     set({ busy: false });
     buttonsChanged();
@@ -133,20 +108,7 @@ async function submit(path, body, then = showCalibration) {
 // ---- user actions
 
 const actions = {
-  digit: (digit) => set({ pin: `${get().pin}${digit}`.slice(0, 12) }),
-  deleteDigit: () => set({ pin: get().pin.slice(0, -1) }),
-  pinTyped: ({ target }) => set({ pin: target.value }),
-
-  async enter(event) {
-    event.preventDefault();
-    const { pin, hasPin, wait } = get();
-    if (wait > 0 || !pin) return;
-    if (pin.length < 4) return set({ error: { code: "pin.short", message: t("pin.short"), remedy: "" } }); // keep the digits
-    await submit(hasPin ? "/api/technician/unlock" : "/api/technician/pin", { pin }, () => set({ view: "opening" }));
-    if (get().view === "opening") await refresh();
-  },
-
-  lock: () => submit("/api/technician/lock", {}, showLogin),
+  lock,
   openSection: (section) => set({ section }),
 
   setName({ target }) {
@@ -217,15 +179,8 @@ function numberOrText(text) {
   return Number.isFinite(value) ? value : text;
 }
 
-// Report activity on touch, which extends the login; polling does not.
-function reportActivity() {
-  const { view } = get();
-  if (view === "door" || view === "opening" || performance.now() - activityMs < ACTIVITY_MS) return;
-  activityMs = performance.now();
-  request("/api/technician/here", {}).catch(() => {}); // the next poll shows the error
-}
-addEventListener("pointerdown", reportActivity);
-addEventListener("keydown", reportActivity);
+for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => get().view !== "opening" && reportActivity());
+document.addEventListener("login-changed", refresh);
 
 // ---- storage: theme and technician's name in localStorage; the dismissed results in sessionStorage
 

@@ -5,7 +5,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Query, Response
 
 from device.calibration.archive import Archive, StoredCalibration
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
@@ -13,8 +13,6 @@ from device.errors import CalibrationError, HeadMismatch
 from device.head import fault_names, kind_of
 from device.optics.trial_lens import PowerVector
 from services.errors import Busy
-from services.http.authentication import PinAuthenticator
-from services.http.dependencies import login_renewal, login_required
 from services.http.media import JpegResponse, file_responses, no_picture
 from services.http.problem_responses import error_text
 from services.http.routes.trial_lenses import trial_lens_answer
@@ -42,12 +40,11 @@ STEP_FILES: dict[CalibrationTarget, str] = {"cap": "darks.npz", "screen": "flats
 PREVIEW_RESPONSES = file_responses("image/jpeg") | no_picture("no picture within 2 s, or no calibration runs")
 
 
-def calibration_router(arbiter: HeadArbiter, authenticator: PinAuthenticator) -> APIRouter:
-    """Return the router of the calibration; every endpoint needs the login."""
+def calibration_router(arbiter: HeadArbiter) -> APIRouter:
+    """Return the router of the calibration."""
     router = APIRouter()
-    router.include_router(_read_router(arbiter), dependencies=[Depends(login_required(authenticator))])
-    for part in (_write_router(arbiter), _trial_lens_router(arbiter)):
-        router.include_router(part, dependencies=[Depends(login_renewal(authenticator))])
+    for part in (_read_router(arbiter), _write_router(arbiter), _trial_lens_router(arbiter)):
+        router.include_router(part)
     return router
 
 

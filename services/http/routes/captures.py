@@ -4,11 +4,12 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.concurrency import run_in_threadpool
 
 from services.errors import RecordNotFound
+from services.http.access import require_light_role
 from services.http.media import file_responses
 from services.http.schemas.captures import CaptureAnswer, CaptureList, NewCapture, capture_answer
 from services.instrument.exam import ExamService
@@ -42,19 +43,20 @@ def press_router(
         return pictures.capture_target(press.eye, key, press.visit, press.slot)
 
     @router.post("/api/captures", status_code=201)
-    async def create_capture(press: NewCapture) -> CaptureAnswer:
+    async def create_capture(press: NewCapture, request: Request) -> CaptureAnswer:
         """Take one picture and store it.
 
         With `visit` and `slot` the picture belongs to that slot, and the visit needs a given consent; without them it
-        is a test picture. `key` is an idempotency key: a repeated request returns the first capture, also after a
-        restart of the server. Answers 201 with the capture once it is stored. Refused before it is accepted: 403 for a
-        cross-origin request (CSRF), 404 for an unknown visit or slot, 409 while the camera is busy, without consent, in
-        a finished visit, for a key of another request or while another screen holds the control lease, 422 for an
-        invalid body or a slot of the other eye, 423 without a valid calibration, 500 or 503 if the store cannot be
-        read. Failed after it: 409 if the consent was withdrawn or the server is stopping, 423 if light, heat or power
-        forbid the exposure, 500 if the store is damaged, 503 if a part of the head does not answer or the store is
-        locked or read-only, 507 if the disk is full.
+        is a test picture of a technician. `key` is an idempotency key: a repeated request returns the first capture,
+        also after a restart of the server. Answers 201 with the capture once it is stored. Refused before it is
+        accepted: 401 and 403 without the right, 403 for a cross-origin request (CSRF), 404 for an unknown visit or
+        slot, 409 while the camera is busy, without consent, in a finished visit, for a key of another request or while
+        another screen holds the control lease, 422 for an invalid body or a slot of the other eye, 423 without a valid
+        calibration, 500 or 503 if the store cannot be read. Failed after it: 409 if the consent was withdrawn or the
+        server is stopping, 423 if light, heat or power forbid the exposure, 500 if the store is damaged, 503 if a part
+        of the head does not answer or the store is locked or read-only, 507 if the disk is full.
         """
+        require_light_role(request, press.visit)
         found = await run_in_threadpool(stored_or_target, press)  # reads the database
         if isinstance(found, Capture):
             return capture_answer(found)

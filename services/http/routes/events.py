@@ -2,7 +2,7 @@
 
 from collections.abc import AsyncIterator
 
-from fastapi import APIRouter, Header
+from fastapi import APIRouter, Header, Request
 from pydantic_core import to_json
 
 from device.errors import StoreError
@@ -19,7 +19,7 @@ def event_router(arbiter: HeadArbiter) -> APIRouter:
     router = APIRouter()
 
     @router.get("/api/events", response_class=EventStream, responses={200: {"model": ServerSentEvent}})
-    async def events(last_event_id: int | None = Header(None, ge=0)) -> EventStream:
+    async def events(request: Request, last_event_id: int | None = Header(None, ge=0)) -> EventStream:
         """Stream server-sent events, with a heartbeat (`beat`) every second.
 
         `state`: state of the instrument. `aim`: aiming hint. `button`: the button on the handle was pressed. `stage`:
@@ -27,11 +27,14 @@ def event_router(arbiter: HeadArbiter) -> APIRouter:
         stored capture. `failed`: an error (`code`, `message`, `remedy`). `accuracy`: progress of the accuracy explorer.
         `notice`: an alert, by its `code`, is active from now on, with its values (`n`, `date`, `wait_s`), or ended
         (`over`); alerts that are active already are part of the status. `calibration`: new findings of the calibration
-        monitor. With `Last-Event-ID` the stream resumes after that event. 503 if too many streams are open.
+        monitor. With `Last-Event-ID` the stream resumes after that event. It ends with
+        the login. 503 if too many streams are open.
         """
 
         async def lines() -> AsyncIterator[str]:
             async for event in arbiter.context.event_bus.subscribe(last_event_id):
+                if not request.state.is_admitted():
+                    return
                 if event.kind != "kept":
                     yield sse_text(event)
                 elif (capture := _readable(arbiter.context.store, str(event.data["id"]))) is not None:

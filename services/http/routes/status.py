@@ -105,5 +105,6 @@ def status_answer(
         problem=problem_body(problem) if problem else None,
         standing=[AlertAnswer.model_validate(alert) for alert in alerts.active_alerts()],
         sending=UploadCountsAnswer.model_validate(upload_worker.counts()) if upload_worker is not None else None,
+        last_capture_at=next((capture.taken_at for capture in store.captures(1)), None),
         notices=[finding.remedy for finding in arbiter.findings if not finding.ok and not is_age_warning(finding)],
     )

@@ -2,13 +2,11 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Request
+from fastapi import APIRouter, Header, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from device.errors import InputError
-from services.http.authentication import PinAuthenticator
-from services.http.dependencies import login_renewal
 from services.http.schemas.updates import UpdateAnswer, UpdateChoice
 from services.instrument.update_requests import UpdateRequests
 from services.update.ipc import UpdateRequest
@@ -16,11 +14,8 @@ from services.update.ipc import UpdateRequest
 UPLOAD_PATH = "/api/update/file"
 
 
-def update_routes(desk: UpdateRequests, authenticator: PinAuthenticator) -> APIRouter:
-    """Return the router under /api/update; its changing requests need the login and restart the idle timeout.
-
-    The application must include it with a login check for the reading request.
-    """
+def update_routes(desk: UpdateRequests) -> APIRouter:
+    """Return the router under /api/update."""
     router = APIRouter(prefix="/api/update")
 
     @router.get("")
@@ -28,9 +23,8 @@ def update_routes(desk: UpdateRequests, authenticator: PinAuthenticator) -> APIR
         """Return the running version, the progress of an update, the updates found, and the last error."""
         return UpdateAnswer.model_validate(desk.status())
 
-    acting = [Depends(login_renewal(authenticator))]
-    router.include_router(_request_router(desk), dependencies=acting)
-    router.include_router(_upload_router(desk), dependencies=acting)
+    router.include_router(_request_router(desk))
+    router.include_router(_upload_router(desk))
     return router
 
 

@@ -8,6 +8,7 @@ from device.values import Eye
 from services.health.alerts import AlertCode
 from services.http.schemas.common import OmittedIfNone, PublicText, ResponseBody
 from services.http.schemas.problems import ProblemResponse
+from services.records.json_values import Timestamp
 
 SignificantDigits = Annotated[float, PlainSerializer(lambda number: float(f"{number:.4g}"), return_type=float)]
 
@@ -52,6 +53,7 @@ class StatusAnswer(ResponseBody):
     captures. `controller`: public name of the screen with the control lease, or null. `problem`: error that prevents
     captures now, or null. `standing`: active alerts. `sending`: counts of the upload queue; null if upload is not set
     up. `notices`: remedies of the failed findings of the calibration monitor, without the age warning.
+    `last_capture_at`: time of the newest picture, or null.
     """
 
     name: str
@@ -68,6 +70,7 @@ class StatusAnswer(ResponseBody):
     standing: list[AlertAnswer]
     sending: UploadCountsAnswer | None
     notices: list[str]
+    last_capture_at: Timestamp | None
 
 
 class CheckAnswer(ResponseBody):

@@ -1,0 +1,102 @@
+"""Set-up, sign-in, lock and users on the page: by keyboard, without accessibility faults, over the kept state."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from services.identity.users import FOLDER, UserTable
+from tests.browser.axe import axe_faults
+from tests.browser.conftest import Complaints, Server
+from tests.browser.looks import look_for_faults
+from tests.simulated import small_head_toml
+
+Open = Callable[..., Page]
+PIN = "274913"
+SIZES = ((1280, 800), (360, 740), (800, 1280))
+
+
+@pytest.fixture
+def own_server(tmp_path: Path) -> Iterator[Server]:
+    """A server of its own, since its users are those of one test; with a small head it starts sooner."""
+    (tmp_path / "head.toml").write_text(small_head_toml("Small head", summed=2))
+    server = Server(tmp_path / "data", str(tmp_path / "head.toml"))
+    server.start()
+    server.wait_until_ready()
+    yield server
+    server.close()
+
+
+def faults(page: Page) -> list[str]:
+    found = []
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(100)
+        found += [f"{width}: {fault}" for fault in look_for_faults(page)]
+    return found + axe_faults(page)
+
+
+def sign_in(page: Page, name: str, pin: str = PIN) -> None:
+    """Sign in by keyboard only."""
+    expect(page.locator("dialog.login")).to_be_visible(timeout=20_000)
+    page.locator("dialog.login [name=name]").fill(name)
+    page.locator("dialog.login [name=secret]").focus()
+    page.keyboard.type(pin)
+    page.keyboard.press("Enter")
+
+
+def test_users_sign_in_lock_and_are_managed(own_server: Server, open_page: Open, complaints: Complaints) -> None:
+    complaints.expect("401", "403", "422")
+    page = open_page(own_server.url)
+    page.wait_for_selector("#new")
+    expect(page.locator("dialog.login")).to_have_count(0)  # the demonstration
+    page.locator("#new").tap()
+    page.wait_for_selector("[data-screen=patient]")
+    before = page.url
+    UserTable(own_server.data / FOLDER).add("Asha", PIN, ["administrator", "screener", "technician"])
+    page.keyboard.press("Tab")
+    expect(page.locator("dialog.login")).to_be_visible(timeout=20_000)
+    page.keyboard.press("Escape")
+    expect(page.locator("dialog.login")).to_be_visible()
+    assert faults(page) == []
+    sign_in(page, "Asha", "000000")
+    expect(page.locator("dialog.login [role=alert]")).to_contain_text("do not belong together")
+    page.wait_for_timeout(1100)
+    sign_in(page, "asha")
+    expect(page.locator("dialog.login")).to_be_hidden()
+    assert page.url == before
+
+    page.goto(f"{own_server.url}/technician")
+    page.locator("[data-section=users]").tap()
+    users = page.locator("instrument-users")
+    expect(users).to_contain_text("Asha")
+    users.locator("[name=name]").fill("Ravi")
+    users.locator("[name=role][value=reader]").check()
+    users.locator("[name=secret]").fill(PIN)
+    users.locator("[name=again]").fill("918274")
+    users.locator("[type=submit]").tap()
+    expect(users.locator("[role=alert]")).to_contain_text("differ")
+    users.locator("[name=again]").fill(PIN)
+    users.locator("[type=submit]").tap()
+    expect(users.locator("[role=status]")).to_contain_text("Ravi was added")
+    assert faults(page) == []
+    page.locator("#lock").tap()
+    expect(page.locator("dialog.login")).to_be_visible()
+
+
+def test_a_new_device_is_set_up_with_its_code(own_server: Server, open_page: Open, complaints: Complaints) -> None:
+    """The request comes through a proxy, so that the page is that of no demonstration."""
+    complaints.expect("401", "403", "429")
+    page = open_page(own_server.url, extra_http_headers={"X-Forwarded-For": "10.42.0.7"})
+    dialog = page.locator("dialog.login")
+    expect(dialog).to_contain_text("Set up this device", timeout=20_000)
+    assert faults(page) == []
+    dialog.locator("[name=code]").fill(UserTable(own_server.data / FOLDER).setup_code() or "")
+    dialog.locator("[name=name]").fill("Asha")
+    for name in ("secret", "again"):
+        dialog.locator(f"[name={name}]").fill(PIN)
+    page.keyboard.press("Enter")
+    expect(dialog).to_be_hidden(timeout=20_000)
+    page.locator("#open-menu").tap()
+    expect(page.locator("#menu")).to_contain_text("Signed in: Asha")

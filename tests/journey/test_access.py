@@ -1,0 +1,273 @@
+"""Access control: every endpoint with every role, without a login, and with an ended one; set-up and users."""
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+
+from device.clock import VirtualClock
+from services.errors import AuthenticationError
+from services.http.access import ACCESS, Access
+from services.http.authentication import OWN_SCREEN, Authenticator, Peer
+from services.http.security import SAFE_METHODS
+from services.identity.logins import IDLE_LOCK_S
+from services.identity.users import ROLES, Role
+from tests.golden import http_transcript
+from tests.journey.conftest import Rig, read_event_stream
+
+PIN = "274913"
+AWAY, HERE = ("10.42.0.7", 50000), ("127.0.0.1", 50000)
+REFUSED = {401: {"access.none", "access.setup", "access.confirm"}, 403: {"access.role"}}
+
+
+def ask(
+    app: Any, method: str, path: str, token: str | None = None, client: tuple[str, int] = AWAY, **options: Any
+) -> httpx.Response:
+    """Send one request from another address, with a login if there is one."""
+
+    async def send() -> httpx.Response:
+        transport = httpx.ASGITransport(app=app, client=client)
+        headers = {"X-Controller": "test"} | ({} if token is None else {"Cookie": f"login={token}"})
+        async with httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30) as browser:
+            return await browser.request(method, path, headers=headers | options.pop("headers", {}), **options)
+
+    return asyncio.run(send())
+
+
+def is_refused(answer: httpx.Response) -> bool:
+    """Return whether access control refused a request; a file or another problem is none of its answers."""
+    is_problem = answer.headers.get("content-type", "").startswith("application/json")
+    code = answer.json().get("code") if is_problem else None
+    return code in REFUSED.get(answer.status_code, set())
+
+
+@pytest.fixture(scope="module")
+def rig(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """An instrument with one user of each role."""
+    with ExitStack() as undo:
+        rig = build(tmp_path_factory.mktemp("access"), undo, wait=False)
+        users = rig.authenticator.users
+        for role in ("administrator", *ROLES[:3]):
+            users.add(role, PIN, [role])
+        yield rig
+
+
+def tokens(rig: Rig) -> dict[str, str]:
+    """Return a login of each user, which has the name of the role."""
+    return {role: rig.authenticator.sign_in(role, PIN, OWN_SCREEN) for role in ROLES}
+
+
+def filled(path: str) -> str:
+    """Return the path with a value for each parameter, of a record that does not exist."""
+    for name, value in {"{id}": "none", "{name}": "none.png", "{eye}": "OD", "{name:path}": "none"}.items():
+        path = path.replace(name, value)
+    return path
+
+
+def test_every_operation_is_in_the_table_and_nothing_else_is() -> None:
+    served = operations(http_transcript.openapi())
+    assert {operation for operation in ACCESS if " /api/" in operation} == {" ".join(one) for one in served}
+
+
+def operations(document: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return method and path of every operation of an OpenAPI document."""
+    return [(verb.upper(), path) for path, verbs in document["paths"].items() for verb in verbs]
+
+
+def test_each_operation_admits_its_roles_and_refuses_all_others(rig: Rig) -> None:
+    """Try each operation as each role, without a login, and with a login that was guessed, expired or revoked."""
+    signed_in, wrong, tried = tokens(rig), [], 0
+    clock = VirtualClock()
+    ended = Authenticator(rig.store.folder.parent / "access", clock)
+    expired, revoked = (ended.sign_in("screener", PIN, OWN_SCREEN) for _ in range(2))
+    ended.logins.end(revoked)
+    clock.sleep(IDLE_LOCK_S)
+    assert ended.user(expired, OWN_SCREEN) is ended.user(revoked, OWN_SCREEN) is None
+    left_out = [("GET", "/api/events"), ("DELETE", "/api/login")]  # a stream; and the end of the login that is tried
+    pages = [("GET", "/"), ("GET", "/technician"), ("GET", "/web/{name:path}")]
+    for verb, path in [one for one in operations(rig.app.openapi()) if one not in left_out] + pages:
+        rule = ACCESS[f"{verb} {path}"]
+        for name, token in {**signed_in, "none": None, "guessed": "a" * 43, "expired": expired}.items():
+            if not admits(rule, name) or name == "administrator" or verb in SAFE_METHODS:
+                tried += 1
+                at = filled(path) if name == "technician" else filled(path).replace("preview", "preview?visit=none")
+                if admits(rule, name) == is_refused(ask(rig.app, verb, at, token, json=body(verb))):
+                    wrong.append((verb, path, name))
+    assert wrong == []
+    assert tried > 250
+
+
+def body(verb: str) -> Any:
+    return None if verb in SAFE_METHODS else {}
+
+
+def admits(rule: Access, name: str) -> bool:
+    return rule.from_anywhere or name in rule.roles
+
+
+def test_an_operation_without_a_row_is_refused_at_run_time(rig: Rig) -> None:
+    rig.app.add_api_route("/api/unknown", lambda: "served", methods=["GET"])
+    try:
+        answer = ask(rig.app, "GET", "/api/unknown", tokens(rig)["administrator"])
+        assert (answer.status_code, answer.json()["code"]) == (403, "access.role")
+    finally:
+        rig.app.router.routes.pop()
+
+
+def test_light_for_a_visit_is_the_screeners_and_a_test_picture_the_technicians(rig: Rig) -> None:
+    signed_in = tokens(rig)
+    picture: dict[str, Any] = {"eye": "OD", "key": "0" * 16}
+    for_visit = picture | {"visit": "none", "slot": "R-centre"}
+    for role, body, path in (
+        ("screener", picture, "/api/preview"),
+        ("technician", for_visit, "/api/preview?visit=none"),
+    ):
+        assert is_refused(ask(rig.app, "POST", "/api/captures", signed_in[role], json=body))
+        assert is_refused(ask(rig.app, "GET", path, signed_in[role]))
+    assert ask(rig.app, "POST", "/api/captures", signed_in["screener"], json=for_visit).status_code == 404
+    assert rig.world.illumination is None
+
+
+def test_the_device_itself_reads_status_and_health_and_nothing_else(rig: Rig) -> None:
+    for path in ("/api/status", "/api/health"):
+        assert ask(rig.app, "GET", path, client=HERE).status_code == 200
+        assert is_refused(ask(rig.app, "GET", path))
+        assert is_refused(ask(rig.app, "GET", path, client=HERE, headers={"X-Forwarded-For": "10.42.0.7"}))
+    assert is_refused(ask(rig.app, "GET", "/api/visits", client=HERE))
+
+
+@pytest.fixture
+def fresh(build: Callable[..., Rig], tmp_path: Any) -> Iterator[Rig]:
+    with ExitStack() as undo:
+        yield build(tmp_path, undo, wait=False)
+
+
+def test_the_demonstration_ends_for_good_with_the_first_user(fresh: Rig) -> None:
+    state = ask(fresh.app, "GET", "/api/login", client=HERE).json()
+    assert (state["user"]["is_demo"], "administrator" in state["user"]["roles"]) == (True, False)
+    assert ask(fresh.app, "GET", "/api/visits", client=HERE).status_code == 200
+    assert is_refused(ask(fresh.app, "GET", "/api/visits"))
+    assert is_refused(ask(fresh.app, "GET", "/api/users", client=HERE))
+    fresh.authenticator.users.add("Asha", PIN, ["administrator"])
+    (fresh.store.folder.parent / "access" / "users.json").unlink()
+    for client in (HERE, AWAY):
+        assert ask(fresh.app, "GET", "/api/visits", client=client).status_code in (401, 500)
+        assert ask(fresh.app, "GET", "/api/login", client=client).json()["needs_setup"] is False
+        answer = ask(fresh.app, "POST", "/api/login", client=client, json={"name": "Asha", "secret": PIN})
+        assert (answer.status_code, answer.json()["code"]) == (500, "store.damaged")
+
+
+def test_set_up_signs_in_the_first_administrator_once(fresh: Rig) -> None:
+    code = fresh.authenticator.users.setup_code()
+    asha = {"name": "Asha", "secret": PIN}
+    wrong = ask(fresh.app, "POST", "/api/setup", json=asha | {"code": "AAAA-AAAA"})
+    assert (wrong.status_code, wrong.json()["code"]) == (403, "access.wrong")
+    early = ask(fresh.app, "POST", "/api/setup", json=asha | {"code": code})
+    assert (early.status_code, early.json()["code"], early.headers["Retry-After"]) == (429, "access.wait", "1")
+    fresh.clock.sleep(1)
+    assert ask(fresh.app, "POST", "/api/setup", json=asha | {"code": code, "secret": "123456"}).status_code == 422
+    done = ask(fresh.app, "POST", "/api/setup", json=asha | {"code": code})
+    assert done.json()["user"] == {"name": "Asha", "roles": list(ROLES), "is_demo": False}
+    cookie = done.headers["set-cookie"].lower()
+    assert all(part in cookie for part in ("login=", "httponly", "samesite=strict", "path=/"))
+    assert "max-age" not in cookie
+    assert ask(fresh.app, "POST", "/api/setup", json=asha | {"code": code}).status_code == 404
+
+
+def test_over_tls_the_cookie_is_bound_to_the_host(fresh: Rig) -> None:
+    fresh.authenticator.users.add("Asha", PIN, ["administrator"])
+
+    async def cookie() -> str:
+        transport = httpx.ASGITransport(app=fresh.app, client=AWAY)
+        async with httpx.AsyncClient(transport=transport, base_url="https://eye.local") as browser:
+            answer = await browser.post("/api/login", json={"name": "Asha", "secret": PIN})
+            return answer.headers["set-cookie"]
+
+    made = asyncio.run(cookie())
+    assert made.startswith("__Host-login=")
+    assert "Secure" in made
+
+
+def test_a_user_is_managed_and_signed_out_by_each_change(fresh: Rig) -> None:
+    users, app = fresh.authenticator.users, fresh.app
+    users.add("Asha", PIN, ["administrator"])
+    asha = fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)
+    ravi: dict[str, Any] = {"name": "Ravi", "secret": PIN, "roles": ["screener"]}
+    assert ask(app, "POST", "/api/users", asha, json=ravi).status_code == 201
+    assert ask(app, "POST", "/api/users", asha, json=ravi).status_code == 422
+
+    def sign_in(secret: str = PIN) -> str:
+        return str(ask(app, "POST", "/api/login", json={"name": "ravi", "secret": secret}).cookies["login"])
+
+    def reads(token: str) -> bool:
+        return ask(app, "GET", "/api/visits", token).status_code == 200
+
+    changes: tuple[tuple[Role, ...], ...] = (("reader",), ("technician",))
+    for roles in changes:
+        token = sign_in()
+        assert reads(token)
+        assert ask(app, "PATCH", "/api/users/Ravi", asha, json={"roles": roles}).status_code == 200
+        assert not reads(token)
+    ask(app, "PATCH", "/api/users/Ravi", asha, json={"secret": "918274", "roles": ["reader"]})
+    token = sign_in("918274")
+    other = sign_in("918274")
+    changed = ask(app, "PUT", "/api/login/secret", token, json={"secret": "918274", "new": PIN})
+    assert not reads(token)
+    assert not reads(other)
+    token = changed.cookies["login"]
+    assert reads(token)
+    assert ask(app, "DELETE", "/api/users/Ravi", asha).json()["users"][0]["name"] == "Asha"
+    assert not reads(token)
+    assert ask(app, "DELETE", "/api/users/Asha", asha).status_code == 422
+
+
+def test_a_risk_needs_the_secret_again_and_polling_does_not_extend_a_login(fresh: Rig) -> None:
+    users, app = fresh.authenticator.users, fresh.app
+    users.add("Asha", PIN, ["administrator", "screener"])
+    token = fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)
+    fresh.clock.sleep(IDLE_LOCK_S - 1)
+    assert ask(app, "POST", "/api/login/activity", token).status_code == 200
+    fresh.clock.sleep(1)
+    late = ask(app, "GET", "/api/users", token)
+    assert (late.status_code, late.json()["code"]) == (401, "access.confirm")
+    assert ask(app, "POST", "/api/login/confirm", token, json={"secret": "000000"}).status_code == 403
+    fresh.clock.sleep(1)
+    assert ask(app, "POST", "/api/login/confirm", token, json={"secret": PIN}).status_code == 200
+    assert ask(app, "GET", "/api/users", token).status_code == 200
+    for _ in range(3):
+        fresh.clock.sleep(IDLE_LOCK_S / 3)
+        ask(app, "GET", "/api/visits", token)
+        ask(app, "POST", "/api/controller", token, json={"key": "0" * 16})
+    assert is_refused(ask(app, "GET", "/api/visits", token))
+
+
+def test_an_event_stream_ends_with_its_login(fresh: Rig) -> None:
+    fresh.authenticator.users.add("Asha", PIN, ["reader", "administrator"])
+    token = fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)
+    cookie = {"Cookie": f"login={token}", "Host": "eye.local"}
+
+    def sign_out() -> None:
+        fresh.authenticator.logins.end(token)
+
+    received = asyncio.run(read_event_stream(fresh.app, lambda _: False, cookie, begin=sign_out))
+    assert len(received) <= 2
+
+
+def test_a_remote_client_cannot_keep_the_device_locked(fresh: Rig) -> None:
+    """1,000 wrong attempts from the network; at the device itself the user waits at most a minute."""
+    fresh.authenticator.users.add("Asha", PIN, ["administrator"])
+    answers = set()
+    for _ in range(1000):
+        try:
+            fresh.authenticator.sign_in("Asha", "000000", Peer("10.42.0.7", False))
+        except AuthenticationError as refused:
+            answers.add(refused.code)
+        fresh.clock.sleep(1)
+    assert answers == {"access.wrong", "access.wait"}
+    assert fresh.authenticator.wait_s("Asha", OWN_SCREEN) <= 60
+    fresh.clock.sleep(60)
+    here = ask(fresh.app, "POST", "/api/login", client=HERE, json={"name": "Asha", "secret": PIN})
+    assert here.status_code == 200
