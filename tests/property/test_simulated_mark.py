@@ -585,6 +585,10 @@ COMMANDS = {  # commands that write pictures; the others print, draw plots, or m
     "run",
 }
 OTHER_COMMANDS = {
+    "programme check",
+    "users add",
+    "users list",
+    "users reset",
     "health",
     "doctor",
     "meter",
