@@ -39,6 +39,7 @@ GROUPS = {
     "archive": "services.archive.command",
     "programme": "services.records.programme_command",
     "users": "services.identity.users_command",
+    "audit": "services.identity.audit_command",
 }
 
 

@@ -21,7 +21,7 @@ from device.clock import VirtualClock
 from device.errors import CalibrationDamaged, CalibrationMissing, DiffuscopeError
 from services.backup.backup_key import KEY_FILE, key_for_recipients, read_key, write_key
 from services.errors import BackupDamaged, RecordNotFound, StoreDamaged
-from services.identity.users import UserTable
+from services.identity.users import ROLES, UserTable
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
@@ -89,7 +89,7 @@ def filled_store(folder: Path, *, with_log: bool) -> Path:
         queue.record_success(first, UploadReceipt("0" * 64, "sha256"))
         CaptureJournal(store).begin(InterruptedCapture("2026-9-OD", "OD", visit, "R-centre", 1), next(keys))
         Archive(original / "calibrations" / "head").add_and_activate(calibration(), WHO)
-        UserTable(original / "access").add("Asha", PIN, ["administrator"])
+        UserTable(original / "access").add("Asha", PIN, ROLES)
         write_key(original, key_for_recipients([RECIPIENT]))
         if with_log:
             return shutil.copytree(original, folder / "with log")

@@ -43,6 +43,7 @@ UPLOADS = Access(frozenset({"screener", "technician"}))
 SERVICE = Access(frozenset({"technician"}))
 UPKEEP = Access(frozenset({"technician", "administrator"}))
 KEYS = Access(frozenset({"technician", "administrator"}), confirmed=True)
+ADMINISTRATION = Access(frozenset({"administrator"}))
 USERS = Access(frozenset({"administrator"}), confirmed=True)
 
 ACCESS: dict[str, Access] = {
@@ -60,6 +61,7 @@ ACCESS: dict[str, Access] = {
     "POST /api/users": USERS,
     "PATCH /api/users/{name}": USERS,
     "DELETE /api/users/{name}": USERS,
+    "GET /api/audit": ADMINISTRATION,
     "GET /api/status": MONITORED,
     "GET /api/health": MONITORED,
     "GET /api/programme": ANY_USER,
@@ -120,8 +122,9 @@ ACCESS: dict[str, Access] = {
 def access_required(authenticator: Authenticator) -> Callable[[Request], Awaitable[None]]:
     """Return the dependency of every endpoint: it admits the user of a request by `ACCESS`, or raises.
 
-    It leaves in `request.state` the `user` (None for a request without a login) and `is_admitted`, which a stream asks
-    again while it is open. LoginRequired, SetupRequired, ConfirmationRequired or AccessDenied.
+    It leaves in `request.state` the `user` (None for a request without a login), `operation` and `audit_address` for
+    the audit trail, and `is_admitted`, which a stream asks again while it is open. LoginRequired, SetupRequired,
+    ConfirmationRequired or AccessDenied.
     """
 
     async def admit(request: Request) -> None:
@@ -131,6 +134,8 @@ def access_required(authenticator: Authenticator) -> Callable[[Request], Awaitab
             raise AccessDenied(f"{operation} is not in the table of rights")
         token, peer = login_token(request), Peer.of(request)
         acts = rule.is_use and request.method not in SAFE_METHODS
+        request.state.operation, request.state.audit_address = operation, peer.address
+        request.state.user = None
         request.state.user = _admitted(authenticator, rule, token, peer, acts)
         request.state.is_admitted = lambda: _is_admitted(authenticator, rule, token, peer)
 

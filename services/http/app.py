@@ -13,12 +13,14 @@ from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
 from services.health.alert_monitor import AlertMonitor, AlertSources
 from services.http.access import access_required
+from services.http.audit_trail import AuditTrail
 from services.http.authentication import Authenticator
 from services.http.client_limits import PREVIEW_LIMITS, STREAM_LIMITS, ClientLimits, limit_clients
 from services.http.control_lease import ControlLease
 from services.http.dependencies import acquire_control_lease, acquire_lease_for_light
 from services.http.openapi import DocumentedApp
 from services.http.problem_responses import problem_response, register_error_handlers
+from services.http.routes.audit import audit_router
 from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
 from services.http.routes.events import event_router
@@ -41,6 +43,7 @@ from services.instrument.head_arbiter import HeadArbiter
 from services.instrument.pending_captures import PendingCaptures
 from services.instrument.status import read_status
 from services.instrument.visit_montage import MontageMaker
+from services.records.audit_log import AuditLog
 from services.records.programme import Programme, load_programme
 from services.records.upload_queue import UploadQueue
 from services.records.visit_repository import VisitRepository
@@ -70,6 +73,7 @@ def create_app(
     uploader: Uploader | None = None,
     stream_limits: ClientLimits = STREAM_LIMITS,
     preview_limits: ClientLimits = PREVIEW_LIMITS,
+    audit_log: AuditLog | None = None,
 ) -> Application:
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
@@ -77,6 +81,7 @@ def create_app(
     name of this computer. `programme` None loads the default programme. `technician_routers` are those of the
     technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
+    `audit_log`: None keeps none.
     """
     store = arbiter.context.store
     clock = arbiter.context.clock
@@ -90,6 +95,7 @@ def create_app(
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
     app = _http_application(life, authenticator, own_host_names() if host_names is None else host_names)
+    app.add_middleware(AuditTrail, audit_log=audit_log, clock=clock)
     pending = PendingCaptures()
     controlled = [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
@@ -104,6 +110,7 @@ def create_app(
     app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
     app.include_router(login_router(authenticator))
     app.include_router(users_router(authenticator.users))
+    app.include_router(audit_router(audit_log))
     app.include_router(calibration_router(arbiter))
     for router in (*technician_routers, removal_routes(PictureRemoval(store, visits, clock))):
         app.include_router(router)

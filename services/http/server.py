@@ -29,6 +29,7 @@ from device.light_safety.hazard import light_limits
 from services.backup.backup_runner import BackupRunner
 from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
+from services.errors import StoreDamaged
 from services.health.event_log import EventLog
 from services.http.app import create_app
 from services.http.authentication import OWN_SCREEN, Authenticator
@@ -40,6 +41,7 @@ from services.http.routes.backup import backup_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
+from services.identity.audit_key import audit_key
 from services.identity.users import FOLDER
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
 from services.instrument.allocator import return_freed_arrays
@@ -48,6 +50,7 @@ from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
 from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
+from services.records.audit_log import AuditLog
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
@@ -146,8 +149,15 @@ def serve(
             backup_routes(backups, store, UsbDrives(), clock),
         ]
         authenticator = Authenticator(data / FOLDER, clock, has_demo=_has_demo(spec, address))
-        names = own_host_names() + host_names
-        app = create_app(arbiter, authenticator, programme, names, technician_routers=routers, uploader=uploader)
+        app = create_app(
+            arbiter,
+            authenticator,
+            programme,
+            own_host_names() + host_names,
+            technician_routers=routers,
+            uploader=uploader,
+            audit_log=_audit_log(store, clock),
+        )
         _log_start(app.http.version, store)
         if authenticator.user(None, OWN_SCREEN) is None and not authenticator.users.has_begun:
             log.warning("no user exists yet: `diffuscope users list` with this data folder shows the set-up code")
@@ -155,6 +165,17 @@ def serve(
         stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _audit_log(store: CaptureStore, clock: Clock) -> AuditLog | None:
+    """Return the audit log of a store, None without a key that can be read or on a disk that takes no changes."""
+    if store.refusal is not None:
+        return None
+    try:
+        return AuditLog(store.folder, audit_key(store.folder), clock)
+    except (OSError, StoreDamaged) as error:
+        log.error("no audit log is kept: %s", error)
+        return None
 
 
 def _has_demo(spec: InstrumentSpec, address: socket.socket) -> bool:

@@ -81,6 +81,14 @@ def test_users_sign_in_lock_and_are_managed(own_server: Server, open_page: Open,
     users.locator("[type=submit]").tap()
     expect(users.locator("[role=status]")).to_contain_text("Ravi was added")
     assert faults(page) == []
+    page.locator("[data-section=audit]").tap()
+    audit = page.locator("instrument-audit")
+    expect(audit).to_contain_text("add-user")
+    expect(audit.locator("[role=status]")).to_contain_text("as they were written")
+    audit.locator("[name=action]").fill("sign-in")
+    audit.locator("[type=submit]").tap()
+    expect(audit.locator("li")).to_have_count(2)
+    assert faults(page) == []
     page.locator("#lock").tap()
     expect(page.locator("dialog.login")).to_be_visible()
 

@@ -253,6 +253,7 @@ def access() -> list[dict[str, Any]]:
         log.ask("POST /api/setup", json=ASHA | {"code": users.setup_code()})
         log.ask("GET /api/login")
         _users(log)
+        log.ask("GET /api/audit", "/api/audit?action=sign-in&limit=2")
         log.ask("POST /api/login/activity")
         log.ask("POST /api/login/confirm", json={"secret": "000000"})
         device.clock.elapsed_s += 2
@@ -260,7 +261,13 @@ def access() -> list[dict[str, Any]]:
         log.ask("PUT /api/login/secret", json={"secret": ASHA["secret"], "new": "111111"})
         log.ask("PUT /api/login/secret", json={"secret": ASHA["secret"], "new": "918274"})
         log.ask("DELETE /api/login")
-        for operation in ("GET /api/visits", "GET /api/users", "POST /api/login/activity", "GET /api/preview"):
+        for operation in (
+            "GET /api/visits",
+            "GET /api/users",
+            "GET /api/audit",
+            "POST /api/login/activity",
+            "GET /api/preview",
+        ):
             log.ask(operation, note="no user is signed in")
         log.ask("POST /api/login", json=ASHA, note="the PIN before the change")
         log.ask("POST /api/login", json=ASHA | {"secret": "918274"}, note="too soon after a wrong PIN")

@@ -42,6 +42,7 @@ from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
 from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
+from services.records.audit_log import AuditLog
 from services.records.capture_store import CaptureStore
 from services.records.capture_target import TEST_PICTURE
 from services.records.dose_ledger_tables import DoseLedgerStore
@@ -251,7 +252,13 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
             backup_routes(backups, store, sticks, clock),
         ]
         application = create_app(
-            owner, door, host_names=("eye.local",), usb_drives=sticks, technician_routers=rooms, uploader=carrier
+            owner,
+            door,
+            host_names=("eye.local",),
+            usb_drives=sticks,
+            technician_routers=rooms,
+            uploader=carrier,
+            audit_log=AuditLog(folder / "data", b"k" * 32, clock),
         )
         if calibrated_before:
             assert owner.exam.ready.wait(120)

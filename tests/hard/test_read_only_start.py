@@ -19,7 +19,7 @@ from tests.browser.conftest import copy_small_plans, free_port
 from tests.hard.test_capture_store_full import own_disk
 from tests.project_files import ROOT
 from tests.simulated import small_head_toml
-from tests.store_damage import filled_store
+from tests.store_damage import PIN, filled_store
 
 DISK = 'mount -o remount,size=300m "$1" && cp -a "$2" "$1/data" && '
 CASES = {  # what happens on the disk before the start; the first start wrote a reserve file
@@ -70,6 +70,7 @@ def running(folder: Path, data: Path, prefix: tuple[str, ...]) -> Iterator[httpx
             assert process.poll() is None, (folder / "log").read_text()
             assert time.monotonic() < end_s
             time.sleep(0.1)
+        assert client.post("/api/login", json={"name": "Asha", "secret": PIN}).status_code == 200
         yield client
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) == 0, (folder / "log").read_text()

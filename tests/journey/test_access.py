@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,10 +12,12 @@ import pytest
 from device.clock import VirtualClock
 from services.errors import AuthenticationError
 from services.http.access import ACCESS, Access
+from services.http.app import create_app
 from services.http.authentication import OWN_SCREEN, Authenticator, Peer
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
 from services.identity.users import ROLES, Role
+from services.records.audit_log import AuditLog
 from tests.golden import http_transcript
 from tests.journey.conftest import Rig, read_event_stream
 
@@ -271,3 +274,41 @@ def test_a_remote_client_cannot_keep_the_device_locked(fresh: Rig) -> None:
     fresh.clock.sleep(60)
     here = ask(fresh.app, "POST", "/api/login", client=HERE, json={"name": "Asha", "secret": PIN})
     assert here.status_code == 200
+
+
+def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:
+    """Sign-in, its failure, view, change, refused light: user, record and field, and no value."""
+    log = AuditLog(tmp_path, b"k" * 32, fresh.clock)
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
+    fresh.authenticator.users.add("Asha", PIN, ROLES)
+    ask(app, "POST", "/api/login", json={"name": "Asha", "secret": "000000"})
+    fresh.clock.sleep(1)
+    token = ask(app, "POST", "/api/login", json={"name": "Asha", "secret": PIN}).cookies["login"]
+    visit = ask(app, "POST", "/api/visits", token, json={"key": "0" * 16}).json()["id"]
+    at = f"/api/visits/{visit}"
+    ask(app, "PATCH", at, token, json={"key": "1" * 16, "field": "name", "value": "Meena K."})
+    for _ in range(3):
+        ask(app, "GET", at, token)
+    ask(app, "POST", "/api/captures", token, json={"key": "2" * 16, "eye": "OD", "visit": visit, "slot": "R-centre"})
+    ask(app, "GET", at)
+    found = [(one.user, one.action, one.record, one.more.get("field"), one.more["status"]) for one in log.entries(100)]
+    assert found[::-1] == [
+        ("Asha", "sign-in", "", None, "403"),
+        ("Asha", "sign-in", "", None, "200"),
+        ("Asha", "begin-visit", visit, None, "201"),
+        ("Asha", "answer", visit, "name", "200"),
+        ("Asha", "view", visit, None, "200"),
+        ("Asha", "capture", visit, None, "409"),
+        ("", "view", visit, None, "401"),
+    ]
+    assert b"Meena" not in (tmp_path / "audit-log.jsonl").read_bytes()
+    shown = ask(app, "GET", "/api/audit?action=sign-in", token).json()
+    assert ([entry["number"] for entry in shown["entries"]], shown["problem"]) == ([2, 1], None)
+    (tmp_path / "audit-log.jsonl").write_bytes(b"")
+    assert ask(app, "GET", "/api/audit", token).json()["problem"] is not None
+
+
+def test_without_room_for_the_audit_log_the_exam_goes_on(fresh: Rig, tmp_path: Path) -> None:
+    log = AuditLog(tmp_path / "missing", b"k" * 32, fresh.clock)
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
+    assert ask(app, "POST", "/api/visits", client=HERE, json={"key": "0" * 16}).status_code == 201

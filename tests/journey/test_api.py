@@ -389,7 +389,14 @@ def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
         "/api/visits/{id}/export": {"post"},
     }
     served = {path: set(verbs) for path, verbs in document["paths"].items()}
-    own = ("/api/technician", "/api/calibration", "/api/login", "/api/setup", "/api/users")  # test_access.py
+    own = (
+        "/api/technician",
+        "/api/calibration",
+        "/api/login",
+        "/api/setup",
+        "/api/users",
+        "/api/audit",
+    )  # test_access.py
     assert {path: verbs for path, verbs in served.items() if not path.startswith(own)} == fixed
     press = document["paths"]["/api/captures"]["post"]["responses"]
     assert "201" in press

@@ -585,6 +585,7 @@ COMMANDS = {  # commands that write pictures; the others print, draw plots, or m
     "run",
 }
 OTHER_COMMANDS = {
+    "audit verify",
     "programme check",
     "users add",
     "users list",

@@ -2,6 +2,7 @@
 
 import "./event_log.js";
 import "./accuracy_time.js";
+import "./audit.js";
 import "./backup.js";
 import "./health.js";
 import "./software_update.js";
@@ -18,6 +19,7 @@ const SECTIONS = {
   backup: html`<instrument-backup class="column"></instrument-backup>`,
   space: html`<stored-pictures class="column"></stored-pictures>`,
   users: html`<instrument-users class="column"></instrument-users>`,
+  audit: html`<instrument-audit class="column"></instrument-audit>`,
   update: html`<software-update class="column"></software-update>`,
 };
 

@@ -56,6 +56,7 @@ def press_router(
         server is stopping, 423 if light, heat or power forbid the exposure, 500 if the store is damaged, 503 if a part
         of the head does not answer or the store is locked or read-only, 507 if the disk is full.
         """
+        request.state.audit_record = press.visit or ""
         require_light_role(request, press.visit)
         found = await run_in_threadpool(stored_or_target, press)  # reads the database
         if isinstance(found, Capture):

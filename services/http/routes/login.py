@@ -32,6 +32,7 @@ def _begin_router(authenticator: Authenticator) -> APIRouter:
 
         401 before the first user, 403 for a wrong name or secret, 429 during the lock-out, with the time to wait.
         """
+        request.state.audit_user = typed.name
         token = authenticator.sign_in(typed.name, typed.secret, Peer.of(request))
         authenticator.logins.end(login_token(request))
         return _begun(authenticator, token, request, response)
@@ -39,6 +40,7 @@ def _begin_router(authenticator: Authenticator) -> APIRouter:
     @router.delete("/api/login")
     def sign_out(request: Request, response: Response) -> LoginAnswer:
         """Sign out, which locks the screen; no effect without a login."""
+        request.state.user = authenticator.user(login_token(request), Peer.of(request))
         authenticator.logins.end(login_token(request))
         response.delete_cookie(cookie_name(request), path="/", secure=request.url.scheme == "https", httponly=True)
         return _answer(authenticator, None)
@@ -50,6 +52,7 @@ def _begin_router(authenticator: Authenticator) -> APIRouter:
         403 for a wrong code, 404 once a user exists, 422 for a name or secret that cannot be used, 429 during the
         lock-out.
         """
+        request.state.audit_user = typed.name
         token = authenticator.set_up(typed.code, typed.name, typed.secret, Peer.of(request))
         return _begun(authenticator, token, request, response)
 

@@ -1,6 +1,6 @@
 """Endpoints of the administrator: list, add, change and remove users."""
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 
 from services.http.routes.login import user_answer
 from services.http.schemas.access import NewUser, UserAnswer, UserChange, UserList
@@ -20,8 +20,9 @@ def users_router(users: UserTable) -> APIRouter:
         return answer()
 
     @router.post("", status_code=201)
-    def add_user(new: NewUser) -> UserAnswer:
+    def add_user(new: NewUser, request: Request) -> UserAnswer:
         """Add a user; 422 for a name that is used, or a name, secret or roles that cannot be used."""
+        request.state.audit_record = new.name
         return user_answer(users.add(new.name, new.secret, new.roles))
 
     @router.patch("/{name}")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from datetime import date
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 
 from services.health.clock_request import offer_time
 from services.http.control_lease import ControlLease
@@ -79,19 +79,22 @@ def _form_router(repository: VisitRepository) -> APIRouter:
     router = APIRouter()
 
     @router.post("/api/visits", status_code=201)
-    def begin(order: NewVisit) -> VisitDocument:
+    def begin(order: NewVisit, request: Request) -> VisitDocument:
         """Begin a visit; without a number, of a new patient with the next automatic number.
 
         Answers 201 with the visit; 422 for an invalid number, or an automatic number with a wrong check digit.
         """
-        return visit_answer(repository.begin(order.key, order.number), repository)
+        visit = repository.begin(order.key, order.number)
+        request.state.audit_record = visit.id
+        return visit_answer(visit, repository)
 
     @router.patch("/api/visits/{id}")
-    def answer(id: str, order: FieldValue) -> VisitDocument:
+    def answer(id: str, order: FieldValue, request: Request) -> VisitDocument:
         """Set or clear one form field of a visit.
 
         404 for an unknown visit, 409 for a finished one, 422 for an unknown field or an invalid value.
         """
+        request.state.audit_field = order.field
         return visit_answer(repository.answer(order.key, id, order.field, order.value), repository)
 
     return router

@@ -1,0 +1,99 @@
+"""Audit trail: the actions that enter the audit log, recorded before the answer of the request is sent."""
+
+import logging
+from collections.abc import Callable
+
+from starlette.concurrency import run_in_threadpool
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from device.clock import Clock
+from device.errors import DiffuscopeError
+from services.records.audit_log import AuditLog
+
+log = logging.getLogger(__name__)
+
+VIEW = "view"
+VIEW_AGAIN_S = 300.0  # a page reads what it shows again and again: one entry for each user and record in this time
+ACTIONS = {
+    "POST /api/login": "sign-in",
+    "DELETE /api/login": "sign-out",
+    "POST /api/login/confirm": "confirm",
+    "PUT /api/login/secret": "change-own-secret",
+    "POST /api/setup": "set-up",
+    "POST /api/users": "add-user",
+    "PATCH /api/users/{name}": "change-user",
+    "DELETE /api/users/{name}": "remove-user",
+    "POST /api/visits": "begin-visit",
+    "GET /api/visits/{id}": VIEW,
+    "PATCH /api/visits/{id}": "answer",
+    "POST /api/visits/{id}/slots": "choose-picture",
+    "POST /api/visits/{id}/not-possible": "not-possible",
+    "POST /api/visits/{id}/finish": "finish",
+    "POST /api/visits/{id}/reopen": "reopen",
+    "POST /api/captures": "capture",
+    "GET /api/captures/{id}/{name}": VIEW,
+    "POST /api/captures/{id}/accept": "accept-picture",
+    "POST /api/captures/{id}/eye": "change-eye",
+    "GET /api/visits/{id}/export.zip": "export",
+    "POST /api/visits/{id}/export": "export",
+    "POST /api/calibration": "calibrate",
+    "POST /api/calibration/use": "use-calibration",
+    "PUT /api/technician/pace": "set-time-budget",
+    "POST /api/technician/backup": "backup",
+    "POST /api/technician/backup/passphrase": "set-backup-passphrase",
+    "POST /api/technician/removal": "remove-pictures",
+    "POST /api/technician/removal/undo": "bring-back-pictures",
+    "POST /api/technician/event-log/export": "export-event-log",
+    "POST /api/update/install": "update",
+    "GET /api/audit": "read-audit",
+}
+Append = Callable[..., None]
+
+
+class AuditTrail:
+    """ASGI middleware that records the actions of `ACTIONS`, also refused ones, with user, record and HTTP status.
+
+    `audit_log` None records nothing. A log that cannot be written is reported in the event log; requests go on.
+    """
+
+    def __init__(self, app: ASGIApp, audit_log: AuditLog | None, clock: Clock) -> None:
+        self.app, self._log, self._clock = app, audit_log, clock
+        self._viewed_s: dict[tuple[str, str], float] = {}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one ASGI request to the application, and record its action before the answer begins."""
+
+        async def send_recorded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await self._record(scope, message["status"])
+            await send(message)
+
+        await self.app(scope, receive, send if self._log is None or scope["type"] != "http" else send_recorded)
+
+    async def _record(self, scope: Scope, status: int) -> None:
+        state = scope.get("state", {})
+        action = ACTIONS.get(state.get("operation", ""))
+        if action is None or self._log is None:
+            return
+        user = state.get("user")
+        name = state.get("audit_user") or ("" if user is None else user.name)
+        parameters = scope.get("path_params", {})
+        record = str(parameters.get("id") or parameters.get("name") or state.get("audit_record", ""))
+        if action == VIEW and not self._is_new_view(name, record, status):
+            return
+        more = {"status": str(status), "field": state.get("audit_field", ""), "from": state.get("audit_address", "")}
+        try:
+            await run_in_threadpool(self._log.append, name, action, record, **more)
+        except (OSError, DiffuscopeError) as error:
+            log.error("the audit log cannot be written: %s", error)
+
+    def _is_new_view(self, name: str, record: str, status: int) -> bool:
+        """Return whether a view of this record by this user is to be recorded: each refused one, else the first."""
+        if status >= 400:
+            return True
+        now_s = self._clock.now_s()
+        self._viewed_s = {key: at_s for key, at_s in self._viewed_s.items() if now_s - at_s < VIEW_AGAIN_S}
+        is_new = (name, record) not in self._viewed_s
+        if is_new:
+            self._viewed_s[name, record] = now_s
+        return is_new
