@@ -1,8 +1,8 @@
 """Security middlewares: CSRF and DNS rebinding (Host, Origin, Sec-Fetch-Site), body limit, HEAD, security headers.
 
-Changing requests with a foreign `Origin` are refused. `GET /api/preview` turns the lamp on, and a foreign page can send
-it with an <img>: it needs a same-origin `Sec-Fetch-Site` (browsers set it over https and on localhost), or, without
-that header, any `X-Controller`, which a foreign page cannot send without a CORS preflight.
+Changing requests with a foreign `Origin` or `Sec-Fetch-Site` are refused. `GET /api/preview` turns the lamp on, and a
+foreign page can send it with an <img>: it needs a same-origin `Sec-Fetch-Site` (browsers set it over https and on
+localhost), or, without that header, any `X-Controller`, which a foreign page cannot send without a CORS preflight.
 """
 
 import asyncio
@@ -31,6 +31,7 @@ SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
 }
 ErrorResponse = Callable[[DiffuscopeError], Response]
 
@@ -59,6 +60,8 @@ class CrossOriginProtection:
             return UntrustedHost(f"{host[:80]!r} is not a name of this camera")
         if scope["method"] not in SAFE_METHODS and origin is not None and _authority(origin) != (host or "").lower():
             return CrossOriginRequest(f"a page of {origin[:80]!r} asked for a change")
+        if scope["method"] not in SAFE_METHODS and headers.get("sec-fetch-site", "none") not in SAME_ORIGIN_SITES:
+            return CrossOriginRequest("a page of another site asked for a change")
         if scope["path"] in LIGHT_EMITTING_PATHS and not _is_same_origin(headers):
             return CrossOriginRequest("the page that requested light is unknown", "Open the camera's own page to aim.")
         return None

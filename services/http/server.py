@@ -41,7 +41,7 @@ from services.http.routes.backup import backup_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
-from services.identity.audit_key import audit_key
+from services.identity.audit_key import load_or_create_audit_key
 from services.identity.users import FOLDER
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
 from services.instrument.allocator import return_freed_arrays
@@ -172,10 +172,12 @@ def _audit_log(store: CaptureStore, clock: Clock) -> AuditLog | None:
     if store.refusal is not None:
         return None
     try:
-        return AuditLog(store.folder, audit_key(store.folder), clock)
+        audit_log = AuditLog(store.folder, load_or_create_audit_key(store.folder), clock)
+        audit_log.append("", "start", version=version("diffuscope"))
     except (OSError, StoreDamaged) as error:
         log.error("no audit log is kept: %s", error)
         return None
+    return audit_log
 
 
 def _has_demo(spec: InstrumentSpec, address: socket.socket) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from device.clock import SystemClock
-from services.identity.audit_key import audit_key
+from services.identity.audit_key import read_audit_key
 from services.records.audit_log import AuditLog
 from services.running_time import announced
 
@@ -22,6 +22,6 @@ def root() -> None:
 @announced("checking the audit log")
 def verify(data: Annotated[Path, typer.Option(help="Where captures are kept.")]) -> None:
     """Check that no entry was changed, added, moved or left out; the exit status is 1 if one was."""
-    found = AuditLog(data, audit_key(data), SystemClock()).check()
+    found = AuditLog(data, read_audit_key(data), SystemClock()).check()
     typer.echo(f"{found.entries} entries are as they were written" + (f"; {found.problem}" if found.problem else "."))
     raise typer.Exit(1 if found.problem else 0)

@@ -12,17 +12,22 @@ FILE, BYTES = "audit-key", 32
 REMEDY = "Restore it from a backup: the entries of the audit log cannot be checked without it."
 
 
-def audit_key(data: Path) -> bytes:
-    """Return the key of a data folder, which is made if neither key nor log exists.
+def load_or_create_audit_key(data: Path) -> bytes:
+    """Return the key of a data folder, which is made if neither key nor log exists; OSError if it cannot be written.
 
-    StoreDamaged for a key of another length, or a log without a key; OSError if it cannot be written.
+    StoreDamaged as by `read_audit_key`.
     """
     file = data / FOLDER / FILE
     if not file.exists() and not (data / LOG).exists():
         atomic_io.make_private(file.parent)
         atomic_io.write_atomically(file, secrets.token_bytes(BYTES))
+    return read_audit_key(data)
+
+
+def read_audit_key(data: Path) -> bytes:
+    """Return the key of a data folder; StoreDamaged for a key that is missing or of another length."""
     try:
-        key = file.read_bytes()
+        key = (data / FOLDER / FILE).read_bytes()
     except FileNotFoundError as error:
         raise StoreDamaged("the key of the audit log is missing", REMEDY) from error
     if len(key) != BYTES:

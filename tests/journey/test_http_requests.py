@@ -1,5 +1,6 @@
 """Requests as proxies and monitors send them: HEAD of every GET route, chunked bodies, an IPv6 address."""
 
+import secrets
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -11,6 +12,7 @@ from services.http.server import base_url
 STREAMS = ("/api/events",)
 LIT = ("/api/preview",)
 CHANGING = frozenset({"date", "content-length", "set-cookie"})  # of answers that hold times
+CHANGE_BY_SITE = [("cross-site", 403), ("same-site", 403), ("same-origin", 201), ("none", 201)]
 PRESS = b'{"eye":"OS"}'
 
 
@@ -76,3 +78,11 @@ def test_a_chunked_body_below_the_limit_is_read(rig: Any) -> None:
 )
 def test_the_printed_address_opens(host: str, url: str) -> None:
     assert base_url(host, 8000) == url
+
+
+@pytest.mark.parametrize(("site", "status"), CHANGE_BY_SITE)
+def test_a_change_that_another_site_asks_for_is_refused_without_an_origin(rig: Any, site: str, status: int) -> None:
+    headers = {"Sec-Fetch-Site": site}
+    answer = rig.request("POST", "/api/visits", headers=headers, json={"key": secrets.token_hex(8)})
+    assert answer.status_code == status
+    assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from device.calibration.archive import Archive
 from services.cli import app
+from services.identity.users import FOLDER, ROLES, UserTable
 from tests.golden.command_line import subcommands
 from tests.ports.conftest import HEAD
 from tests.ports.emulators.wires import emulated_buses
@@ -82,6 +83,11 @@ WITHOUT_HEAD = {  # files, stores, simulated scenes: no part of a head is opened
     "update answer",
     "update tidy",
     "update status",
+    "audit verify",
+    "programme check",
+    "users add",
+    "users list",
+    "users reset",
     "snapshots list",
     "snapshots restore",
     "store check",
@@ -110,6 +116,7 @@ OPENING = {  # every module outside device/head.py that calls one of them, and i
 }
 LIT_ENDPOINTS = {"POST /api/captures", "GET /api/preview", "POST /api/calibration/trial-lenses/ready"}
 MAIN = [sys.executable, "-c", "from services.cli import main; main()"]
+PIN = "274913"
 ENDPOINTS = 58  # at least: a new one is tried without a change here
 
 
@@ -213,7 +220,10 @@ def test_a_command_without_light_leaves_the_ring_dark(heads: Heads, command: Wor
 
 
 class Server:
-    """`diffuscope run` with a head whose light is never permitted, and a client that is logged in as technician."""
+    """`diffuscope run` with a head whose light is never permitted, and a client of a user with every role.
+
+    A head with a real lamp has no demonstration user.
+    """
 
     def __init__(self, heads: Heads) -> None:
         head = heads.folder / "served.toml"
@@ -222,6 +232,7 @@ class Server:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
+        UserTable(heads.folder / "served" / FOLDER).add("Asha", PIN, ROLES)
         words = ["run", "--head", str(head), "--port", str(port), "--data", str(heads.folder / "served")]
         self.process = subprocess.Popen([*MAIN, *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{port}", headers={"X-Controller": "a test"}, timeout=20)
@@ -229,6 +240,7 @@ class Server:
 
     def wait(self) -> None:
         wait_until(self._is_ready)
+        assert self.ask("POST", "/api/login", json={"name": "Asha", "secret": PIN}).is_success
 
     def _is_ready(self) -> bool:
         with suppress(httpx.HTTPError):
@@ -236,9 +248,10 @@ class Server:
         return False
 
     def operations(self) -> list[tuple[str, str]]:
-        """Return method and path of every endpoint."""
+        """Return method and path of every endpoint; that which ends the login is the last one."""
         paths = self.ask("GET", "/api/openapi.json").json()["paths"]
-        return [(method.upper(), path) for path, methods in paths.items() for method in methods]
+        found = [(method.upper(), path) for path, methods in paths.items() for method in methods]
+        return sorted(found, key=lambda operation: operation == ("DELETE", "/api/login"))
 
     def lenses(self) -> dict[str, Any]:
         found: dict[str, Any] = self.ask("GET", "/api/calibration").json()

@@ -10,7 +10,7 @@ import pytest
 from device.clock import VirtualClock
 from services import cli
 from services.errors import StoreDamaged
-from services.identity.audit_key import audit_key
+from services.identity.audit_key import load_or_create_audit_key, read_audit_key
 from services.records.audit_log import HEAD, LOG, AuditLog
 
 TRIALS = 1000
@@ -120,19 +120,19 @@ def test_entries_are_filtered_newest_first_and_hold_no_long_text(tmp_path: Path)
 
 
 def test_a_log_without_its_key_is_damaged_and_the_key_is_made_once(tmp_path: Path) -> None:
-    key = audit_key(tmp_path)
-    assert audit_key(tmp_path) == key
+    key = load_or_create_audit_key(tmp_path)
+    assert load_or_create_audit_key(tmp_path) == read_audit_key(tmp_path) == key
     AuditLog(tmp_path, key, VirtualClock()).append("Asha", "view")
     (tmp_path / "access/audit-key").write_bytes(key[:-1])
     with pytest.raises(StoreDamaged, match="damaged"):
-        audit_key(tmp_path)
+        load_or_create_audit_key(tmp_path)
     (tmp_path / "access/audit-key").unlink()
     with pytest.raises(StoreDamaged, match="missing"):
-        audit_key(tmp_path)
+        load_or_create_audit_key(tmp_path)
 
 
 def test_the_command_verifies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    AuditLog(tmp_path, audit_key(tmp_path), VirtualClock()).append("Asha", "view")
+    AuditLog(tmp_path, load_or_create_audit_key(tmp_path), VirtualClock()).append("Asha", "view")
 
     def verified() -> tuple[object, str]:
         with pytest.raises(SystemExit) as ended:
