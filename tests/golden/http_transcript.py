@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from services.delivery.upload_worker import BACKOFF_FIRST_S
-from services.identity.users import UserTable
+from services.identity.users import SETUP_CODE
 from tests.golden import compare
 from tests.golden.instrument import Refusing, instrument, until
 from tests.golden.transcript import Transcript
@@ -15,6 +15,7 @@ UNKNOWN_CAPTURE, UNKNOWN_VISIT = "20260101T000000-OD-ffffff", "20260101T000000-f
 RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, which measures in another thread
 LENSES = "/api/calibration/trial-lenses"
 ASHA, STANDS = {"name": "Asha", "secret": "274913"}, ("cap", "screen", "point")
+CODE = "ABCDEFGH"
 NO_USER: dict[str, Any] = {"note": "no user: sent through a proxy", "headers": {"X-Forwarded-For": "10.42.0.7"}}
 
 
@@ -244,13 +245,15 @@ def _finished_visit(log: Transcript) -> str:
 def access() -> list[dict[str, Any]]:
     """Record the set-up, wrong attempts with their lock-out, the users, signing out, and the idle lock."""
     with instrument(calibrated_before=False) as device:
-        log, users = Transcript(device), UserTable(device.folder / "access")
+        log = Transcript(device)
+        (device.folder / "access").mkdir()
+        (device.folder / "access" / SETUP_CODE).write_text(CODE)  # otherwise a random one
         log.ask("GET /api/login", note="the demonstration user")
         log.ask("POST /api/login", json=ASHA, note="no user exists yet")
         log.ask("POST /api/setup", json=ASHA | {"code": "AAAAAAAA"})
         device.clock.elapsed_s += 2
-        log.ask("POST /api/setup", json=ASHA | {"code": users.setup_code(), "secret": "123456"})
-        log.ask("POST /api/setup", json=ASHA | {"code": users.setup_code()})
+        log.ask("POST /api/setup", json=ASHA | {"code": CODE, "secret": "123456"})
+        log.ask("POST /api/setup", json=ASHA | {"code": CODE})
         log.ask("GET /api/login")
         _users(log)
         log.ask("GET /api/audit", "/api/audit?action=sign-in&limit=2")

@@ -48,7 +48,7 @@ class Normaliser:
             plain = re.sub(pattern, self._numbered(kind), plain)
         plain = re.sub(r"\b[0-9a-f]{64}\b", "<sha256>", plain)
         plain = re.sub(r"/web/[0-9a-f]{12}/", "/web/<mark>/", plain)
-        plain = re.sub(r"technician=[\w-]{20,}", "technician=<token>", plain)
+        plain = re.sub(r"login=[\w-]{20,}", "login=<token>", plain)
         plain = re.sub(r"\bin frame \d+\b", "in frame <number>", plain)  # how many came before depends on the load
         plain = re.sub(TIME, "<time>", plain)
         return re.sub(r"\b\d{4}-\d\d-\d\d( \d\d:\d\d)?\b", "<date>", plain)

@@ -42,7 +42,10 @@ def _begin_router(authenticator: Authenticator) -> APIRouter:
         """Sign out, which locks the screen; no effect without a login."""
         request.state.user = authenticator.user(login_token(request), Peer.of(request))
         authenticator.logins.end(login_token(request))
-        response.delete_cookie(cookie_name(request), path="/", secure=request.url.scheme == "https", httponly=True)
+        is_secure = request.url.scheme == "https"
+        response.set_cookie(
+            cookie_name(request), max_age=0, httponly=True, samesite="strict", path="/", secure=is_secure
+        )
         return _answer(authenticator, None)
 
     @router.post("/api/setup")
