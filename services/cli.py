@@ -128,11 +128,18 @@ def run(
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
     address = inherited_socket(os.environ) or bind_socket(host, port)
     served, at = address.getsockname()[:2]
+    folder = data or _default_data()
+
+    def ready(needs_setup: bool) -> None:
+        typer.echo(f"Open {base_url(served, at)} in a browser")
+        if needs_setup:
+            typer.echo(f"It asks for the set-up code, which `diffuscope users list --data {folder}` prints")
+
     serve(
         spec,
         address,
-        data or _default_data(),
-        lambda: typer.echo(f"Open {base_url(served, at)} in a browser"),
+        folder,
+        ready,
         Watchdog(os.environ.get("NOTIFY_SOCKET")),
         plan,
         measure_scene,

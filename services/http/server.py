@@ -112,7 +112,7 @@ def serve(
     spec: InstrumentSpec,
     address: socket.socket,
     data: Path,
-    ready: Callable[[], None],
+    ready: Callable[[bool], None],
     watchdog: Watchdog,
     programme: Programme,
     measure: Measure,
@@ -123,9 +123,10 @@ def serve(
     """Open the store and the head, call `ready`, and serve at `address` until SIGTERM, SIGINT or a failure.
 
     The page is available while the exam still plans its FFTs; an error that stopped the server is raised at the end.
-    `data`: data folder. `host_names`: accepted host names beside the own and local ones. `measure`: the frontier
-    measurement of this device. `updater`: the updater's state folder and its request folder. `uploader`: uploads to the
-    receiver. Everything that was opened is closed at every exit. SystemExit(0) for a signal before the server runs.
+    `data`: data folder. `ready` takes whether the page asks for the set-up code of the first user. `host_names`:
+    accepted host names beside the own and local ones. `measure`: the frontier measurement of this device. `updater`:
+    the updater's state folder and its request folder. `uploader`: uploads to the receiver. Everything that was opened
+    is closed at every exit. SystemExit(0) for a signal before the server runs.
     """
     return_freed_arrays()
     clock = SystemClock()
@@ -159,9 +160,7 @@ def serve(
             audit_log=_audit_log(store, clock),
         )
         _log_start(app.http.version, store)
-        if authenticator.user(None, OWN_SCREEN) is None and not authenticator.users.has_begun:
-            log.warning("no user exists yet: `diffuscope users list` with this data folder shows the set-up code")
-        ready()
+        ready(not authenticator.users.has_begun and authenticator.user(None, OWN_SCREEN) is None)
         stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")

@@ -22,7 +22,7 @@ from tests.updates import DEVICE, Board
 
 OFFERED = "99.0"
 STEPS = """The channel {channel} offers version {offered}, signed with test keys.
-Open {page}/technician, set a PIN, open Update and tap "Look for an update".
+Open {page}/technician, open Update and tap "Look for an update".
 Real here: page, requests, updater, signature of the channel, size and SHA-256 of the download.
 A laptop has no second boot slot, no RAUC and no firmware to try it: these are stand-ins, the restart is only noted.
 With real ones: make bundle, make test-appliance, make test-boot (services/update/README.md). Ctrl-C ends it.
