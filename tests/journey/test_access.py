@@ -52,10 +52,14 @@ def rig(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFactory) -> 
     """An instrument with one user of each role."""
     with ExitStack() as undo:
         rig = build(tmp_path_factory.mktemp("access"), undo, wait=False)
-        users = rig.authenticator.users
-        for role in ("administrator", *ROLES[:3]):
-            users.add(role, PIN, [role])
+        add_users(rig)
         yield rig
+
+
+def add_users(rig: Rig) -> None:
+    """Add one user of each role, which is the name too; the first user must be an administrator."""
+    for role in ("administrator", *ROLES[:3]):
+        rig.authenticator.users.add(role, PIN, [role])
 
 
 def tokens(rig: Rig) -> dict[str, str]:
@@ -120,20 +124,6 @@ def test_an_operation_without_a_row_is_refused_at_run_time(rig: Rig) -> None:
         rig.app.router.routes.pop()
 
 
-def test_light_for_a_visit_is_the_screeners_and_a_test_picture_the_technicians(rig: Rig) -> None:
-    signed_in = tokens(rig)
-    picture: dict[str, Any] = {"eye": "OD", "key": "0" * 16}
-    for_visit = picture | {"visit": "none", "slot": "R-centre"}
-    for role, body, path in (
-        ("screener", picture, "/api/preview"),
-        ("technician", for_visit, "/api/preview?visit=none"),
-    ):
-        assert is_refused(ask(rig.app, "POST", "/api/captures", signed_in[role], json=body))
-        assert is_refused(ask(rig.app, "GET", path, signed_in[role]))
-    assert ask(rig.app, "POST", "/api/captures", signed_in["screener"], json=for_visit).status_code == 404
-    assert rig.world.illumination is None
-
-
 def test_the_device_itself_reads_status_and_health_and_nothing_else(rig: Rig) -> None:
     for path in ("/api/status", "/api/health"):
         assert ask(rig.app, "GET", path, client=HERE).status_code == 200
@@ -146,6 +136,21 @@ def test_the_device_itself_reads_status_and_health_and_nothing_else(rig: Rig) ->
 def fresh(build: Callable[..., Rig], tmp_path: Any) -> Iterator[Rig]:
     with ExitStack() as undo:
         yield build(tmp_path, undo, wait=False)
+
+
+def test_light_for_a_visit_is_the_screeners_and_a_test_picture_the_technicians(fresh: Rig) -> None:
+    add_users(fresh)
+    signed_in = tokens(fresh)
+    picture: dict[str, Any] = {"eye": "OD", "key": "0" * 16}
+    for_visit = picture | {"visit": "none", "slot": "R-centre"}
+    for role, body, path in (
+        ("screener", picture, "/api/preview"),
+        ("technician", for_visit, "/api/preview?visit=none"),
+    ):
+        assert is_refused(ask(fresh.app, "POST", "/api/captures", signed_in[role], json=body))
+        assert is_refused(ask(fresh.app, "GET", path, signed_in[role]))
+    assert ask(fresh.app, "POST", "/api/captures", signed_in["screener"], json=for_visit).status_code == 404
+    assert fresh.world.illumination is None
 
 
 def test_the_demonstration_ends_for_good_with_the_first_user(fresh: Rig) -> None:
