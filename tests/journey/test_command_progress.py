@@ -26,6 +26,8 @@ NOT_ANNOUNCED = {
     "store backup": ASKING,
     "store restore": ASKING,
     "snapshots restore": ASKING,
+    "users add": ASKING,
+    "users reset": ASKING,
     "frontier": STEPS,
     "bench": STEPS,
     "paper": STEPS,
