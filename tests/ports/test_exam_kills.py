@@ -1,5 +1,6 @@
 """Kill tests of the whole instrument with the real ring on an emulated SPI bus, during aiming and during a press."""
 
+import json
 import os
 import random
 import socket
@@ -9,16 +10,19 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from http.cookiejar import CookieJar
 from pathlib import Path
 from threading import Thread
 
 import pytest
 
+from services.identity.users import FOLDER, ROLES, UserTable
 from tests.ports.conftest import HEAD
 from tests.ports.emulators.kills import Sleeper
 from tests.ports.emulators.wires import EmulatedBuses, emulated_buses
 
 ROOT = HEAD.parents[2]
+PIN = "274913"
 READY_S = 300.0  # TimeoutStartSec of the unit: the first start compiles kernels and measures FFTs
 MIXED = '[light]\nbackend = "apa102"'
 
@@ -32,6 +36,8 @@ class Instrument:
         text = text.replace("rows = 1080", "rows = 270").replace("cols = 1920", "cols = 480").replace("5.04", "20.16")
         self.head.write_text(text + "\n[light.chain]\n", encoding="utf-8")
         self.data = folder / "data"
+        UserTable(self.data / FOLDER).add("Asha", PIN, ROLES)  # a real ring has no demonstration user
+        self.cookies = CookieJar()
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
@@ -42,6 +48,7 @@ class Instrument:
         command = [sys.executable, "-c", "from services.cli import main; main()", *arguments]
         process = subprocess.Popen(command, cwd=ROOT, env=os.environ.copy(), stdout=subprocess.DEVNULL)
         try:
+            self.wait_until(lambda: self.ask("/api/login", json.dumps({"name": "Asha", "secret": PIN}).encode()))
             self.wait_until(lambda: self.ask("/api/preview?after=0") is not None)
             yield process
         finally:
@@ -60,7 +67,8 @@ class Instrument:
     def ask(self, path: str, body: bytes | None = None) -> bytes | None:
         head = {"X-Controller": "test"} | ({"Content-Type": "application/json"} if body else {})
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}{path}", data=body, headers=head)
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(self.cookies))
+        with opener.open(request, timeout=20) as answer:
             return answer.read() if answer.status != 204 else None
 
     def use(self) -> None:

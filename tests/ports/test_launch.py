@@ -22,6 +22,7 @@ from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics.matrix import chain_of, ring
 from device.values import ExposureSettings, Illumination
+from services.identity.users import FOLDER, UserTable
 from services.imaging.picture_files import read_raw_tiff
 from tests.ports.conftest import HEAD
 from tests.ports.emulators.wires import emulated_buses
@@ -101,6 +102,9 @@ def test_a_press_gives_a_simulated_picture_and_its_light_is_printed(tmp_path: Pa
     launched = Launched(tmp_path)
     try:
         launched.wait_until_ready()
+        code = UserTable(tmp_path / "data" / FOLDER).setup_code()
+        user = {"name": "Asha", "secret": "274913", "code": code}
+        launched.client.post("/api/setup", json=user).raise_for_status()  # real drivers have no demonstration user
         capture = launched.client.post("/api/captures", json={"eye": "OD"}).raise_for_status().json()
         at = f"/api/captures/{capture['id']}"
         picture, raw = (launched.client.get(f"{at}/{name}").content for name in ("picture.png", "raw.tiff"))
@@ -114,6 +118,7 @@ def test_a_press_gives_a_simulated_picture_and_its_light_is_printed(tmp_path: Pa
     assert set(printed) == ring_frames(spec, Illumination("green"), Illumination("red"))
     assert {printed[0], printed[-1]} == ring_frames(spec)
     assert "thermometer, 25.0 C" in launched.output
+    assert "It asks for the set-up code" in launched.output
 
 
 def test_a_mixed_head_lights_the_real_ring_for_a_simulated_camera() -> None:
