@@ -1,6 +1,7 @@
 """Text of `diffuscope calibrations` for one archived calibration."""
 
 from device.calibration.archive import StoredCalibration
+from device.calibration.procedure.lens_check import lens_messages
 from device.values import Calibration, Geometry, RefractionOffset, RefractionZero, WhiteReference
 
 ZERO_WORDS: dict[RefractionZero, str] = {
@@ -85,7 +86,8 @@ def _warnings(kept: StoredCalibration) -> tuple[str, ...]:
         notes.append(
             f"IMPORTED from {printable(provenance.source or 'somewhere')}, {len(provenance.unknown)} things unknown"
         )
-    return (", ".join(notes),) if notes else ()
+    lenses = lens_messages(dict(provenance.figures))
+    return (*((", ".join(notes),) if notes else ()), *lenses)
 
 
 def _geometry(geometry: Geometry | None) -> str:

@@ -16,6 +16,7 @@ from device.optics.diffuser import Refraction
 from device.recon.estimation.psf_warp import transform, warped
 from device.recon.model.spots import GAP_LIGHT, Spots, find_spots, without_noise
 from device.sim.plan import decide
+from device.sim.render import convolved_with_disc
 from device.values import Calibration, Geometry, Image, Psf, Sensor
 from services import resources
 from tests.paper.bench import Bench
@@ -124,6 +125,14 @@ def test_calibration_finds_lenses_without_spot_gaps_and_centres_that_moved() -> 
     assert found(gaps).beside > GAP_LIGHT
     for spots, word in ((covered, "covered"), (found(gaps), "gaps"), (moved, "moved by")):
         assert [word in message for message in lens_messages(lens_figures(spots, lenses, before))] == [True]
+
+
+def test_spots_of_a_wider_point_source_than_stated_are_told_from_those_of_lenses() -> None:
+    """A disc of 48 um, as 275 um behind 25 mm, and one of 9 um, which the spots hide."""
+    wide, narrow = (Psf(convolved_with_disc(seen().pixels, um / PITCH_UM)) for um in (48, 9))
+    lenses = optics().element.lenses
+    assert list(lens_messages(lens_figures(found(narrow), lenses, None))) == []
+    assert "width of the point source" in " ".join(lens_messages(lens_figures(found(wide), lenses, None)))
 
 
 def without_spot(psf: Psf, lens: tuple[float, float, float]) -> Psf:

@@ -43,7 +43,10 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
   const frames = report.frames ?? [];
   const used = frames.filter((frame) => frame.used).length;
   const channels = report.channels ?? [];
+  const light = report.verdict?.numbers.light_e_per_um2;
   const rows = [
+    ...(report.device?.head ? [["head", report.device.head]] : []),
+    ...(light === undefined ? [] : [["light", t("detail.light.value", { light: number(light, 1) })]]),
     ["method", report.method],
     ["rounds", report.rounds],
     ["stopped", report.stopped],

@@ -16,11 +16,14 @@ const HEADLINES = {
 const UNITS = {
   black_dn: ["dn", 2], white_dn: ["dn", 0], gain_e_per_dn: ["e_per_dn", 3], read_noise_e: ["e", 2],
   dark_e_per_s: ["e_per_s", 2], bad_pixels: ["plain", 0], screen_shading: ["plain", 2], psf_spread_px: ["px", 0],
+  lenses_without_spot: ["plain", 0], lens_light_beside: ["percent", 1], lens_misfit: ["percent", 1], lens_focus_dpt: ["dpt", 1],
+  lens_moved_um: ["um", 1],
   prnu: ["percent", 2], psf_pedestal_residual: ["percent", 4], residual: ["percent", 4],
 };
 const RESULTS = [
   "black_dn", "gain_e_per_dn", "read_noise_e", "white_dn", "psf_spread_px", "psf_pedestal_residual", "bad_pixels",
-  "dark_e_per_s", "prnu", "screen_shading",
+  "dark_e_per_s", "prnu", "screen_shading", "lenses_without_spot", "lens_light_beside", "lens_misfit", "lens_focus_dpt",
+  "lens_moved_um",
 ];
 
 const textOr = (key, otherwise, vars) => t(has(key, vars) ? key : otherwise, vars);
@@ -262,7 +265,8 @@ function provenance(calibration) {
     ["zero", t(ZEROS[calibration.zero])],
     ["id", calibration.id],
   ];
-  return html`<dl>${rows.map(([key, value]) => html`<dt>${t(`made.${key}`)}</dt><dd>${value}</dd>`)}</dl>`;
+  return html`<dl>${rows.map(([key, value]) => html`<dt>${t(`made.${key}`)}</dt><dd>${value}</dd>`)}</dl>
+    ${calibration.notes.map((note) => html`<p class="warning">${icon("warn")} ${note}</p>`)}`;
 }
 
 function results({ numbers }) {

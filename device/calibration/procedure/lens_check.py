@@ -12,6 +12,7 @@ from device.values import Calibration
 ALIGNMENTS = 4  # of spots to lenses: shift and rotation, then the nearest lens again
 OWN_SPOT = 1 / 3  # of the distance to the nearest lens: a spot farther away is another lens's
 SAME_SPOT_UM = 30.0  # farther away is another lens, or a spot that a fault has displaced
+MAX_MISFIT = 0.2  # as drawn 0.03 to 0.06, lenses of 0.15 waves rms
 MAX_MOVED_UM = 1.0  # rms along an axis: 2 um cost 0.007 of the correlation of detail (OPTICS.md 2.9)
 
 Places = NDArray[np.float64]
@@ -40,6 +41,11 @@ def lens_messages(figures: dict[str, float]) -> Iterable[str]:
         yield f"lenses without a spot of their own: {missing:.0f}, covered or merged with another lens"
     if (beside := figures.get("lens_light_beside", 0.0)) > GAP_LIGHT:
         yield f"{beside:.0%} of the light passes beside the lenses: see whether there are clear gaps between them"
+    if (misfit := figures.get("lens_misfit", 0.0)) > MAX_MISFIT:
+        yield (
+            f"the spots differ from those of lenses by {misfit:.0%}: see whether the point source is at most 100 um "
+            "wide behind a lens of 25 mm, and its stated width is true"
+        )
     if (moved_um := figures.get("lens_moved_um", 0.0)) > MAX_MOVED_UM:
         yield f"the centres of the lenses have moved by {moved_um:.1f} um since the calibration before"
 

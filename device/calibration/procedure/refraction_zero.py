@@ -17,12 +17,12 @@ MIN_SAME_PATTERN = 0.98  # measured again 0.9999, keystone of 1 % 0.974 to 0.988
 MIN_SAME_DIFFUSER = 0.5  # turned by 1 degree 0.64; another diffuser 0.25
 LIKENESS, CHANGE = "psf_likeness", "zero_change_dpt"  # figures of the provenance
 ZERO_REMEDY = (
-    "Put the point source into the focus of the model eye's lens, see that diffuser and sensor sit tight, and "
-    "calibrate again. If the head was taken apart, show trial lenses: they fix the zero."
+    "Put the point source into the focus of the model eye's lens, see that diffuser or lenslets and sensor sit "
+    "tight, and calibrate again. If the head was taken apart, show trial lenses: they fix the zero."
 )
 PATTERN_REMEDY = (
-    "See that diffuser and sensor sit tight, straight and unturned, and calibrate again. If the diffuser was "
-    "exchanged, this is its new pattern."
+    "See that diffuser or lenslets and sensor sit tight, straight and unturned, and calibrate again. If they were "
+    "exchanged, this is their new pattern."
 )
 
 
@@ -54,7 +54,7 @@ class ZeroCheck:
     def words(self) -> str:
         """One line for the operator."""
         if self.likeness < MIN_SAME_DIFFUSER:
-            return f"point: another diffuser than in calibration {self.id}, which says nothing about the zero"
+            return f"point: another diffuser or plate than in calibration {self.id}, which says nothing of the zero"
         if self.change_dpt is None:
             return (
                 f"point: the pattern is not that of calibration {self.id}, correlation {self.likeness:.2f} (the same "

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Response
 
 from device.calibration.archive import Archive, StoredCalibration
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
+from device.calibration.procedure.lens_check import lens_messages
 from device.errors import CalibrationError, HeadMismatch
 from device.head import fault_names, kind_of
 from device.optics.trial_lens import PowerVector
@@ -235,6 +236,7 @@ def intact_calibration(stored: StoredCalibration) -> IntactCalibration:
         simulated=calibration.simulated,
         zero=calibration.refraction_zero,
         numbers=numbers,
+        notes=list(lens_messages(dict(made.figures))),
         damaged=None,
         in_force=False,
     )

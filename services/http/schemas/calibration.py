@@ -72,7 +72,7 @@ class DamagedCalibration(ResponseBody):
 class IntactCalibration(ResponseBody):
     """A calibration of the archive: its origin, its measured figures (`numbers`), and whether it is in force.
 
-    `zero`: what fixes the zero of the refraction.
+    `zero`: what fixes the zero of the refraction. `notes`: sentences on figures of lenslets beyond their limits.
     """
 
     id: str
@@ -86,6 +86,7 @@ class IntactCalibration(ResponseBody):
     temperature_c: float | None
     simulated: bool
     zero: RefractionZero
+    notes: list[str]
 
 
 ArchivedCalibration = IntactCalibration | DamagedCalibration
