@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace stress-ng lint release bench bench-archive bench-attacks bench-budget bench-data bench-deadline bench-frames bench-kills bench-lesions bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
+.PHONY: help run run-emulated pi gate test test-ports test-faults test-browser test-long test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants page-pictures bundle browser buses strace stress-ng lint release bench bench-archive bench-attacks bench-budget bench-data bench-deadline bench-elements bench-element-refraction bench-frames bench-kills bench-lesions bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers bench-pi channel readme results effects frontier parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -290,6 +290,12 @@ bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times,
 EYES ?= 20
 bench-lesions: .venv/ready ## Print how many drawn lesions of each kind and size are found at one false grain a picture, for each head and 1, 4 and 8 frames; EYES=20.
 	@$(BIN)/python -m tests.bench.lesions --eyes $(EYES)
+
+bench-elements: .venv/ready ## Print picture, refraction and time behind diffuser, lenslets and one lens; PHOTOS="files" VESSELS="their masks", FLAGS="--curved --m-dpt 6".
+	@$(BIN)/python -m tests.bench.elements --photo $(PHOTOS) --vessels $(VESSELS) $(FLAGS)
+
+bench-element-refraction: .venv/ready ## Print error and coverage of the refraction of drawn eyes behind each element; EYES=200 behind lenslets (90 minutes), FLAGS="--other-eyes 60".
+	@$(BIN)/python -m tests.bench.element_refraction --eyes $(if $(filter-out file,$(origin EYES)),$(EYES),200) $(FLAGS)
 
 bench-store: .venv/ready ## End the instrument 200 times and damage its store: what is lost; time from start to a press.
 	@$(BIN)/python -m tests.bench.store

@@ -5,6 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from device.config.element import Lenses, half_widths_um
+
 CLOSEST = 0.83  # of the pitch: a filled packing of discs this far apart has one centre for each square of the pitch
 CANDIDATES = 24  # lattice points along a pitch, of which the centres are drawn
 
@@ -26,6 +28,12 @@ def random_packing(pitch_um: float, iris_um: float, seed: int) -> NDArray[np.flo
         taken.append(places[0])
         places = places[np.hypot(*(places - places[0]).T) >= CLOSEST * pitch_um]
     return np.array(taken)
+
+
+def lenses_in_iris(centres_um: NDArray[np.float64], focal_um: float, iris_um: float) -> Lenses:
+    """Return lenses at those of the centres, (lenses, 2), to which a place of the iris belongs."""
+    found = tuple((float(right), float(down), focal_um) for right, down in centres_um)
+    return tuple(lens for lens, half_um in zip(found, half_widths_um(found, iris_um), strict=True) if half_um)
 
 
 def _pairs(step_um: float, half_um: float) -> NDArray[np.float64]:

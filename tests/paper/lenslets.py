@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from device.config.element import Lenses, half_widths_um
+from device.config.element import Lenses
 from device.sim.plan import decide
 from device.values import Image
-from tests.lens_packing import random_packing, square_array
+from tests.lens_packing import lenses_in_iris, random_packing, square_array
 from tests.paper.bench import Bench, HeadChanges, SimulatedFrame
 from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above
 from tests.paper.pictures import plane
@@ -55,8 +55,7 @@ class Trial(NamedTuple):
 def lenses(kind: str, seed: int) -> Lenses:
     """Return the lenses of a square array or of a random packing; `seed` draws the latter."""
     places = square_array(PITCH_UM, IRIS_UM) if kind == "microlenses" else random_packing(PITCH_UM, IRIS_UM, seed)
-    found = tuple((float(right), float(down), FOCAL_UM) for right, down in places)
-    return tuple(lens for lens, half_um in zip(found, half_widths_um(found, IRIS_UM), strict=True) if half_um)
+    return lenses_in_iris(places, FOCAL_UM, IRIS_UM)
 
 
 def passed_detail(take: SimulatedFrame) -> Passed:
