@@ -47,7 +47,7 @@ def scene(head: str, eye: Eye) -> InstrumentSpec:
         element = spec.optics.element.model_copy(update={"lenses": lenses})
         spec = spec.model_copy(update={"optics": spec.optics.model_copy(update={"element": element})})
     changes: dict[str, object] = {
-        "eye": spec.sim.eye.model_copy(update={name: getattr(eye, name) for name in Eye._fields[:3]}),
+        "eye": spec.sim.eye.model_copy(update={name: getattr(eye, name) for name in ("m_dpt", "j0_dpt", "j45_dpt")}),
         "seed": spec.sim.seed if eye.seed is None else eye.seed,
     }
     if eye.photo is not None:

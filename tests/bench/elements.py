@@ -50,7 +50,8 @@ class Figures(NamedTuple):
     cpu_s: float
 
 
-NONE = Figures(*[float("nan")] * len(Figures._fields))
+NONE = Figures(*[float("nan")] * 7)
+PRINTED = {"pcc": ".3f", "psnr_db": ".1f", "highpass_pcc": ".3f", "vessel_contrast": ".3f", "lp_per_mm": ".1f"}
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,7 @@ def solved(single: Reconstructor, frames: Sequence[Counts]) -> Reconstruction:
 
 def row(head: str, count: int, found: Sequence[Figures]) -> str:
     """Return the line of the table of a head: means over the eyes, error of each refraction, least time."""
-    kinds = zip(Figures._fields[:5], (".3f", ".1f", ".3f", ".3f", ".1f"), strict=True)
-    means = [format(np.nanmean([getattr(figures, name) for figures in found]), form) for name, form in kinds]
+    means = [format(np.nanmean([getattr(figures, name) for figures in found]), form) for name, form in PRINTED.items()]
     errors = " ".join("-" if np.isnan(figures.error_dpt) else f"{figures.error_dpt:+.2f}" for figures in found)
     least_s = np.nanmin([figures.cpu_s for figures in found])
     return f"| {head} | {count} | {' | '.join(means)} | {errors} | {least_s:.1f} |"

@@ -39,12 +39,12 @@ function psfText({ gain_db: gain = null }) {
 // The names are those of `diffuscope simulate`, which says why each effect is simulated or not.
 const effectsText = ({ names, known }) => t("detail.effects.value", { some: names.length, all: known, names: names.join(", ") });
 
-export function detailsDialog({ grey, visit }, actions, { record: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
+function detailRows({ id, report, calibration_id: calibration, links }) {
   const frames = report.frames ?? [];
   const used = frames.filter((frame) => frame.used).length;
   const channels = report.channels ?? [];
   const light = report.verdict?.numbers.light_e_per_um2;
-  const rows = [
+  return [
     ...(report.device?.head ? [["head", report.device.head]] : []),
     ...(light === undefined ? [] : [["light", t("detail.light.value", { light: number(light, 1) })]]),
     ["method", report.method],
@@ -60,6 +60,10 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
     ["calibration", calibration],
     ["id", id],
   ];
+}
+
+export function detailsDialog({ grey, visit }, actions, { record, slot, eye }) {
+  const { id, report, links, versions = [] } = record;
   const move = () => {
     close();
     actions.moveToOtherEye(slot, id);
@@ -68,7 +72,7 @@ export function detailsDialog({ grey, visit }, actions, { record: { id, report, 
     <h2 id="details-title">${t("result.details")}</h2>
     ${(report.warnings ?? []).map((warning) => html`<p class="warning">${icon("warn")} ${warning}</p>`)}
     ${whyGreen(visit) ? html`<p class="muted">${whyGreen(visit)}</p>` : grey && !links.colour ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
-    <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
+    <dl>${detailRows(record).map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
     <p class="links">
       ${visit?.finished_at
         ? nothing
