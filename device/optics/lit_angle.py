@@ -4,16 +4,21 @@ It is wider than the cone of its cap where the dies of its LEDs are no points. O
 width of its dies; the matrix's are small, and its field keeps a sharp edge.
 """
 
+from collections.abc import Callable
 from functools import cache
 from math import acos, pi
 
+import numpy as np
+from numpy.typing import NDArray
+
 from device.config.head_file import InstrumentSpec
 from device.config.shipped_heads import LIGHT_PATH
-from device.optics.led_cap import LedCap, field_to_share_deg, half_maximum_deg
+from device.optics.led_cap import LedCap, field_to_share_deg, half_maximum_deg, relative_irradiance
 from device.optics.light_path import LightPath, led_cap, load_light_path
 from device.optics.matrix import lamps_of
 from device.values import Colour
 
+Floats = NDArray[np.float64]
 EDGE_SHARE = 0.1  # of the axis's irradiance, at the edge of a picture's field: little light comes from beyond
 
 
@@ -45,6 +50,19 @@ def soft_edge_deg(spec: InstrumentSpec) -> tuple[float, float] | None:
     half_deg = half_maximum_deg(cap, magnification)
     outward_deg = (field_to_share_deg(cap, magnification, EDGE_SHARE) - half_deg) / 2
     return half_deg, outward_deg / (0.5 - acos(1 - 2 * EDGE_SHARE) / pi)
+
+
+def lamp_profile(spec: InstrumentSpec) -> Callable[[Floats], Floats] | None:
+    """Return the irradiance of a flat retina over that on the axis, by the angle off the axis in degrees.
+
+    None for a head whose lamp lights its field evenly.
+    """
+    cap = cap_of(spec)
+    if spec.optics is None or cap is None:
+        return None
+    known_deg = np.arange(0.0, 60.0, 0.1)
+    share = relative_irradiance(cap, spec.optics.angular_magnification, known_deg)
+    return lambda away_deg: np.asarray(np.interp(away_deg, known_deg, share))
 
 
 def has_sharp_edge(spec: InstrumentSpec) -> bool:

@@ -328,7 +328,7 @@ def plan_pipeline(
     live = others.get(light.preview_colour, reconstructor)
     if light.preview_colour not in others and live_calibration.psfs[0] is not calibration.psfs[0]:  # an own PSF
         live = Reconstructor(live_calibration, shape, planner, clock, recipes[:1], refract=False)
-    feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
+    feedback = FrameAssessor(calibration, shape, planner, index, head.spec)
     return CapturePipeline(head, clock, reconstructor, live, feedback, bursts, colours, origin)
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from device.config.head_file import CameraSpec
+from device.config.head_file import InstrumentSpec
 from device.errors import FrameError
+from device.optics.lit_angle import lamp_profile
 from device.recon.assessment.aiming import Aim, AimingGuide
 from device.recon.assessment.frame_quality import FrameQualityGate, assess, assess_picture
 from device.recon.assessment.laterality import Laterality, laterality
@@ -25,9 +26,10 @@ class FrameAssessor:
     """
 
     def __init__(
-        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, camera: CameraSpec
+        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, spec: InstrumentSpec
     ) -> None:
-        self._frame_assessor = FrameQualityGate(calibration, shape, planner, index)
+        camera = spec.camera
+        self._frame_assessor = FrameQualityGate(calibration, shape, planner, index, lamp_profile(spec))
         self._aimer = AimingGuide(camera.exposure_s, self._frame_assessor.deg_per_sample)
         self._geometry = calibration.geometry
         self._field_deg = calibration.field_deg
@@ -62,7 +64,9 @@ class FrameAssessor:
         """
         if report.method == NO_METHOD and first.code is None:
             first = FAILED_VERDICT
-        return assess_picture(first, report.residual, report.quality.get("coverage"), target.tries, target.retakes)
+        coverage = report.quality.get("coverage")
+        lit = None if coverage is None else coverage / self._frame_assessor.lit_share
+        return assess_picture(first, report.residual, lit, target.tries, target.retakes)
 
     def estimate_laterality(self, picture: Image, verdict: Verdict, target: CaptureTarget) -> Laterality | None:
         """Return the laterality estimate; `picture` is cropped to the illuminated field.

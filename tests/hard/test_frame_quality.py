@@ -14,6 +14,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
+from device.optics.lit_angle import lamp_profile
 from device.recon.assessment.aiming import AimingGuide, moved_samples
 from device.recon.assessment.frame_quality import FrameFigures, FrameQualityGate, assess, assess_picture
 from device.sim import calibration_targets
@@ -149,6 +150,21 @@ def test_causes_that_one_frame_cannot_show_are_not_reported() -> None:
         ("calm", {"light": {"polariser_leak": 0.05, "ring_um": 4500.0}}),
     ]
     assert [verdict(*case).code for case in missed] == [None] * 3
+
+
+@pytest.mark.parametrize("name", ["human_eye_imx296_power", "human_eye_imx296_power_lenslets"])
+def test_soft_edge_of_the_high_power_ring_is_told_from_a_small_pupil(name: str) -> None:
+    """Behind lenslets the dark edge of its light is seen: 0.78 of the field is lit, and 0.62 is expected."""
+    spec = with_keys(scene(name), peak_e=38_000.0)
+    shape = spec.camera.rows, spec.camera.cols
+    calibration = simulated_calibration(World(spec, VirtualClock()))
+    gate = FrameQualityGate(calibration, shape, scenes.PLANNER, lamp=lamp_profile(spec))
+    codes = []
+    for pupil_um in (7700.0, 1500.0):
+        world = World(with_keys(spec, **eye(pupil_um=pupil_um)), VirtualClock())
+        codes.append(assess(gate(exposed_counts(world), exposed_counts(world, lit=False))).code)
+    assert codes[0] is None
+    assert codes[1] in ("shot.pupil", "shot.edge")
 
 
 def test_after_the_retakes_a_bad_verdict_is_poor() -> None:

@@ -14,7 +14,7 @@ from device.user_files import files_in
 from device.values import Image
 from services import resources
 from tests.paper.bench import SCENES, Bench, SimulatedFrame
-from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above
+from tests.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, below
 from tests.paper.pictures import plane, side_by_side
 
 BRIGHT_SHARE = 15000 / 23000  # of the full well, in the brightest pixel: the light of sim.toml
@@ -27,7 +27,8 @@ SEEN_PCC = {  # the smaller of full and merged pixels; the high-power ring's tru
     "sim": 0.908,
 }
 SLACK = 0.01  # tolerance of a PCC below the measured one
-FILE, HEADS_FILE = "human-eye.png", "heads-eye.png"
+FILE, HEADS_FILE, ELEMENTS_FILE = "human-eye.png", "heads-eye.png", "elements-eye.png"
+ELEMENTS = {WEAK: "diffuser", "imx296_lenslets": "22 lenslets", "imx296_control": "one lens behind a stop"}  # one ring
 NOTE = (
     "The light is a budget, right within a factor of 2.5 in 90 % (nothing was measured), with the quantum efficiency "
     "of the paper's sensor. The other pictures on this page have 7000 to 20 000 electrons in their brightest pixel: "
@@ -107,6 +108,26 @@ def _sensor(camera: CameraSpec) -> tuple[float, ...]:
     )
 
 
+def element_pictures(bench: Bench) -> tuple[Figure, tuple[Claim, ...]]:
+    """Return truth and default picture behind each element in the light of one ring, and what lenslets promise."""
+    takes = {name: bench.expose(f"human_eye_{name}") for name in ELEMENTS}
+    made = {name: bench.solve_default(take) for name, take in takes.items()}
+    detail = {name: takes[name].score(picture).highpass_pcc for name, (picture, _) in made.items()}
+    first = takes[WEAK]
+    words = "a human eye: truth; " + "; ".join(
+        f"{element}, detail {detail[name]:.2f}" for name, element in ELEMENTS.items()
+    )
+    tiles = [(first.truth, first.inside), *((picture, takes[name].inside) for name, (picture, _) in made.items())]
+    gain = detail["imx296_lenslets"] - detail[WEAK]
+    sphere = made["imx296_lenslets"][1].refraction_dpt["sphere"]
+    assert sphere is not None, "the frame gives the refraction"
+    claims = (
+        above("detail behind lenslets minus that behind the diffuser", gain, 0.0).limit_from("better"),
+        below("|mean sphere| of an eye without refraction, behind lenslets, dpt", abs(float(sphere)), 0.1),
+    )
+    return side_by_side(words, ELEMENTS_FILE, tiles), claims
+
+
 def run_light(bench: Bench) -> Outcome:
     """Solve one eye with each head at the eye's own light and in bright light."""
     found = head_pictures(bench, shipped_heads())
@@ -140,7 +161,8 @@ def run_light(bench: Bench) -> Outcome:
     same_field = {STRONG: weak.take.inside}  # of the same sensor, without the penumbra around it: one scale for all
     fields = [(pictures.human, same_field.get(name, pictures.take.inside)) for name, pictures in found.items()]
     shown.append(side_by_side(heads, HEADS_FILE, fields))
-    return Outcome(tuple(claims), tuple(shown), (_table(found),), (NOTE,))
+    elements, promised = element_pictures(bench)
+    return Outcome((*claims, *promised), (*shown, elements), (_table(found),), (NOTE,))
 
 
 def _contrast(take: SimulatedFrame, picture: Image) -> float:

@@ -287,7 +287,7 @@ def check_embedded(text: str, simulated: bool, count: int) -> None:
 
 
 def test_pictures_of_the_documents() -> None:
-    for name in ("human-eye.png", "heads-eye.png"):
+    for name in ("human-eye.png", "heads-eye.png", "elements-eye.png"):
         check(ROOT / "hardware/pictures" / name, True)
     for path in (SHIPPED / "frontier.svg", ROOT / "hardware/pictures/frontier-eye.svg"):
         drawing = path.read_text()
