@@ -20,7 +20,8 @@ def working_bin(psf: Psf, empty: float = STOPBAND_SHARE) -> int:
 
     Frequencies beyond the last ring whose mean |H|^2 exceeds `empty` times its maximum carry no information at the
     light levels of a retina. The caustic of the paper ends near 40 cycles/mm, so its 5 um pixels can be binned 2 x 2,
-    those of an IMX296 3 x 3; behind lenslets, whose |H|^2 has no end, 2 x 2 (NUMERICS.md 7.11). A PSF with fewer than 32 rows or columns gives n = 1.
+    those of an IMX296 3 x 3; behind lenslets, whose |H|^2 has no end, 2 x 2 (NUMERICS.md 7.11). A PSF with fewer than
+    32 rows or columns gives n = 1.
     """
     rows, cols = psf.shape
     if min(rows, cols) < 32:
