@@ -118,6 +118,7 @@ INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibr
 LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_full_field.py hard/test_quality.py hard/test_background.py hard/test_flicker.py \
 	hard/test_far_eyes.py hard/test_ghost.py hard/test_cut_pupils.py hard/test_spots.py hard/test_dark_border.py hard/test_uneven_light.py hard/test_sensor_lines.py \
 	hard/test_given_field.py physics/test_lenslets.py physics/test_lens_design.py physics/test_lens_pictures.py \
+	physics/test_independent_lens_frames.py \
 	unit/test_calibration_lenslets.py journey/test_lens_heads.py unit/test_model_eye.py unit/test_calibration_sequence.py unit/test_montage.py \
 	journey/test_visit_montage.py browser/test_calibration_wizard.py browser/test_software_update.py \
 	browser/test_capture_edge_cases.py browser/test_alerts.py browser/test_instrument_faults.py browser/test_layout_shift.py \

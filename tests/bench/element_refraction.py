@@ -24,7 +24,7 @@ from tests.bench.element_scenes import HEADS, Eye, scene, world
 PLANNER = Planner(folder=None, effort="FFTW_ESTIMATE")
 FIRST_EYE = 1000  # seed of the first drawn eye
 MOST_DPT, MOST_CYLINDER_DPT = 8.0, 2.0
-NAMES = ("sphere", "j0", "j45")
+SIGNS = {"sphere": -1, "j0": -1, "j45": 1}  # of the wavefront, rows down, over those of the lens, axis upwards
 LIMITED = ("lenslets", "lenslets, power")
 MAX_RMS_DPT, MAX_MEAN_DPT = 0.05, 0.02
 WITHIN_2_SD, MAX_BEYOND_4_SD = (0.93, 0.98), 1 / 600
@@ -68,7 +68,7 @@ def errors_and_sds(folder: Path, head: str, seeds: Sequence[int]) -> tuple[Float
         known = json.loads(place(folder, head, seed).read_text(encoding="utf-8"))
         found = known["refraction"]
         if found["sphere"] is not None and found["j0"] is not None:
-            errors[k] = [-found[name] for name in NAMES] - np.array(known["eye"])
+            errors[k] = [sign * found[name] for name, sign in SIGNS.items()] - np.array(known["eye"])
             sds[k] = [found["sd"], found["j0_sd"], found["j45_sd"]]
     return errors, sds
 

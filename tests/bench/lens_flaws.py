@@ -1,6 +1,7 @@
 """Cost of each flaw of lenslets in the picture and refraction of an eye: `python -m tests.bench.lens_flaws`.
 
-One frame at the light of a human eye, with the calibration of the same flawed lenses; "since" is a change after it.
+One frame at the light of a human eye, with the calibration of the same flawed lenses; "since" is a change after it. The
+last column is what the next calibration, of the lenses as they are now, states about them.
 """
 
 import argparse
@@ -10,14 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from device.calibration.procedure.lens_check import lens_figures, lens_messages
 from device.clock import VirtualClock
+from device.config.element import Lenses
 from device.config.head_file import InstrumentSpec, load_head
 from device.config.scene import ElementFlaws, ObjectSpec
+from device.optics import lenslets
 from device.recon.assessment.metrics import PictureScorer
 from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.spots import find_spots
 from device.recon.reconstructor import Reconstructor
 from device.sim.fundus import field_mask
 from device.sim.scene_files import simulate_exposure
+from device.values import Calibration, Psf
 from tests.scenes import PLANNER
 from tests.simulated import SCENES, coarse
 
@@ -39,8 +45,8 @@ def flawed(flaws: dict[str, float], element: dict[str, Any], distances_um: tuple
     return coarse(spec.model_copy(update={"sim": sim, "optics": optics}), 2)
 
 
-def cost(spec: InstrumentSpec, photo: Path | None) -> tuple[float, dict[str, Any]]:
-    """Return the correlation of the detail of a picture with the truth, and the refraction as reported."""
+def cost(spec: InstrumentSpec, photo: Path | None) -> tuple[float, dict[str, Any], Calibration]:
+    """Return the correlation of the detail of a picture with the truth, its refraction, and the calibration."""
     assert spec.sim is not None
     if photo is not None:
         sim = spec.sim.model_copy(update={"object": ObjectSpec(kind="image", image=photo)})
@@ -51,7 +57,26 @@ def cost(spec: InstrumentSpec, photo: Path | None) -> tuple[float, dict[str, Any
     inside = np.asarray(field_mask(exposure.counts.shape, field_radius_px(calibration) - RIM_PX), bool)
     assert calibration.geometry is not None
     judge = PictureScorer(exposure.truth, inside, DETAIL_DEG * calibration.geometry.px_per_deg, exposure.vessels)
-    return judge(made.picture).highpass_pcc, dict(made.report.refraction_dpt or {})
+    return judge(made.picture).highpass_pcc, dict(made.report.refraction_dpt or {}), calibration
+
+
+def stated(spec: InstrumentSpec, drawn: Lenses, before: Calibration | None) -> str:
+    """Return what a calibration of the lenses as they are now states: they should be as `drawn`, and as `before`."""
+    assert spec.sim is not None
+    assert spec.optics is not None
+    pitch_um, flaws = spec.camera.pitch_um, spec.sim.element
+    psf = Psf(lenslets.spots(spec.optics, pitch_um, spec.sim.seed, flaws=flaws))
+    spots = find_spots(psf, spec.optics.geometry(pitch_um))
+    return "no spots" if spots is None else "; ".join(lens_messages(lens_figures(spots, drawn, before)))
+
+
+def merged(lenses: Lenses) -> Lenses:
+    """Return the lenses with the two closest ones as one, in the middle between them."""
+    places = np.array(lenses)
+    apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1)) + 1e9 * np.eye(len(places))
+    first, second = np.unravel_index(int(apart.argmin()), apart.shape)
+    middle = tuple(places[[first, second]].mean(axis=0).tolist())
+    return (*(lens for number, lens in enumerate(lenses) if number not in (first, second)), middle)
 
 
 def rows() -> list[tuple[str, dict[str, float], dict[str, Any], tuple[float, float]]]:
@@ -69,6 +94,9 @@ def rows() -> list[tuple[str, dict[str, float], dict[str, Any], tuple[float, flo
         (f"{gaps} gaps {GAP_SHARE:.0%}", {}, {"aperture_um": round_um, "gaps": gaps}, here)
         for gaps in ("black", "clear")
     ]
+    lenses = optics.element.lenses
+    found += [("a lens missing", {}, {"lenses": lenses[:4] + lenses[5:]}, here)]
+    found += [("two lenses merged", {}, {"lenses": merged(lenses)}, here)]
     found += [(f"sensor {um:+g} um", {}, {}, (z_um + um, z_um + um)) for um in (-200.0, -100.0, 100.0, 200.0)]
     found += [(f"sensor {um:+g} um since", {}, {}, (z_um + um, z_um)) for um in (20.0, 50.0, 100.0)]
     found += [(f"centres {um} um since", {"moved_um": um}, {}, here) for um in (1.0, 2.0, 5.0)]
@@ -82,13 +110,20 @@ def main() -> None:
     words = argparse.ArgumentParser(prog="python -m tests.bench.lens_flaws", description=__doc__)
     words.add_argument("--photo", type=Path, help="photograph instead of the drawn eye")
     asked = words.parse_args()
+    optics = load_head(SCENE).optics
+    assert optics is not None
+    drawn = optics.element.lenses
+    before: Calibration | None = None
     for name, flaws, element, distances_um in rows():
-        detail, refraction = cost(flawed(flaws, element, distances_um), asked.photo)
+        spec = flawed(flaws, element, distances_um)
+        detail, refraction, calibration = cost(spec, asked.photo)
+        before = before or calibration  # as drawn
+        next_one = stated(spec, drawn, before if name.endswith("since") else None)
         sphere, cylinder = refraction.get("sphere"), ""
         if sphere is not None and refraction.get("j0") is not None:
             cylinder = f"{2 * hypot(refraction['j0'], refraction['j45']):6.2f}"
         eye = "refused" if sphere is None else f"{sphere:+6.2f} {cylinder}"
-        print(f"{name:24} {detail:.3f}  {eye}", flush=True)
+        print(f"{name:24} {detail:.3f}  {eye:13} {next_one}", flush=True)
 
 
 if __name__ == "__main__":

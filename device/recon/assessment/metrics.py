@@ -41,7 +41,7 @@ class Scores:
     highpass_pcc
         Correlation of the details.
     vessel_contrast
-        Contrast of the vessels over that in the truth; None if the vessels are unknown.
+        Contrast of the vessels, in units of the truth; None if they are unknown. `truth_contrast` is that of the truth.
     """
 
     pcc: float

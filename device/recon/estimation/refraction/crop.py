@@ -27,6 +27,7 @@ from device.recon.estimation.refraction.pupil import dark_rim
 from device.recon.model.fft_plans import Planner
 
 MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
+SPOT_MODEL_SD_DPT = 0.015  # the same behind lenslets
 VARIANCE_PER_MISFIT = 1.7  # of the misfit: the detail takes up a quarter of the residual; the rest is correlated
 BIAS_SHARE = 0.7  # of b: sd by its own error, as b is taken at the fit and not at the true retina
 MAX_STEPS = 12  # 2 to 4 are usual
@@ -46,7 +47,8 @@ class Refined:
     """Eye (M, J0, J45) in dpt as wavefront, and the misfit; `covariance` is (D' K^-1 D)^-1 of the first step, dpt^2.
 
     `misfit` is the squared residual over its noise per sample: 0.4 to 0.8 where the model explains the frame.
-    `bias_dpt` is what b adds to a step; 0 where b is not computed. `rim_sd` is `pupil.dark_rim` of the last fit.
+    `bias_dpt` is what b adds to a step; 0 where b is not computed. `rim_sd` is `pupil.dark_rim` of the last fit,
+    `model_sd_dpt` the part of the sds by the model.
     """
 
     eye_dpt: Floats
@@ -55,6 +57,7 @@ class Refined:
     misfit: float
     has_settled: bool
     rim_sd: float
+    model_sd_dpt: float
 
     @property
     def is_explained(self) -> bool:
@@ -70,7 +73,7 @@ class Refined:
     def sds_dpt(self) -> Floats:
         """Standard deviations of M, J0 and J45, (3,)."""
         by_residual = VARIANCE_PER_MISFIT * self.misfit * np.diag(self.covariance)
-        return np.asarray(np.sqrt(by_residual + MODEL_SD_DPT**2 + (BIAS_SHARE * self.bias_dpt) ** 2))
+        return np.asarray(np.sqrt(by_residual + self.model_sd_dpt**2 + (BIAS_SHARE * self.bias_dpt) ** 2))
 
 
 class CropRefinement:
@@ -115,7 +118,9 @@ class CropRefinement:
                 break
         self._edges.fit_smooth(eye_dpt)
         rim_sd = dark_rim(self._edges, eye_dpt, fit, self._psf_radius_px)
-        return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled, rim_sd)
+        has_spots = self._edges.likelihood.geometry.lens_focus_dpt is not None
+        model_sd_dpt = SPOT_MODEL_SD_DPT if has_spots else MODEL_SD_DPT
+        return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled, rim_sd, model_sd_dpt)
 
     def _score_of_noise(self, fit: Fit) -> Floats:
         """Return the mean score (3,) that the sensor's noise adds to that of the expected frame of a fit.

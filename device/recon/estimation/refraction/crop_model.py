@@ -39,6 +39,7 @@ DARK_SHARE = 0.1  # of the mean
 NEAR_SAMPLES = 5  # side of the square of the local mean
 RIDGE = 1e-5  # of the mean information on a cosine, for windows whose dark part leaves some of them undetermined
 MODEL_SHARE = 0.0022  # of the mean: sd of what the model lacks
+SPOT_MODEL_SHARE = 0.005  # behind lenslets, whose foci differ over the field: residuals of bright frames
 DERIVATIVE_STEP_DPT = 0.05
 
 Floats = NDArray[np.float64]
@@ -57,13 +58,13 @@ class Weighting:
     inverse_normal: Floats
 
     @classmethod
-    def of(cls, frame: Linear, noise: Noise, least_dn: float) -> "Weighting":
-        """Return the weights for the noise of a sample and for what the model lacks.
+    def of(cls, frame: Linear, noise: Noise, least_dn: float, model_share: float = MODEL_SHARE) -> "Weighting":
+        """Return the weights for the noise of a sample and for what the model lacks, `model_share` of the mean.
 
         They follow the local mean: by a sample itself, noise would weigh itself, and choose its own samples. Samples
         darker than `least_dn`, or than DARK_SHARE of the mean if that is less, have none; 0: all are used.
         """
-        model_dn = MODEL_SHARE * frame.mean_dn
+        model_dn = model_share * frame.mean_dn
         is_used = frame.good >= MIN_GOOD
         near = ndimage.uniform_filter(np.where(is_used, frame.y, 0), NEAR_SAMPLES)
         near /= np.maximum(ndimage.uniform_filter(is_used.astype(np.float32), NEAR_SAMPLES), 1 / NEAR_SAMPLES**2)
@@ -132,7 +133,9 @@ class CropModel:
 
     def start(self, eye_dpt: Floats) -> None:
         """Set the weights of the frame's samples, and the object's prior from the likelihood of an eye."""
-        self._weighting = Weighting.of(self._edges.frame, self._edges.noise, self._edges.dithered_dn)
+        edges = self._edges
+        share = MODEL_SHARE if edges.likelihood.geometry.lens_focus_dpt is None else SPOT_MODEL_SHARE
+        self._weighting = Weighting.of(edges.frame, edges.noise, edges.dithered_dn, share)
         self._set_prior(eye_dpt)
 
     def focus(self, eye_dpt: Floats) -> None:
