@@ -125,7 +125,7 @@ def format_plan(decisions: Sequence[Decision], spent_ms: dict[str, float] | None
         )
     lines.append(
         f"eta: change of the picture over its noise; without --all, --only and --without, the smallest effects are "
-        f"skipped up to a joint eta of {ETA_THRESHOLD:g} (1/20)"
+        f"skipped up to a joint eta of {ETA_THRESHOLD:g} (1/20), and behind lenslets none that is present"
     )
     return "\n".join(lines)
 

@@ -1,7 +1,7 @@
 """Drawing of the plate of lenslets: plan, profile, section, vertices, and tolerances with what each costs."""
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import atan2, degrees, hypot
 from pathlib import Path
 
@@ -121,7 +121,7 @@ def _tolerances() -> Iterator[str]:
         yield from _rows(list(csv.reader(lines)), TOLERANCES_Y, TOLERANCES_X)
 
 
-def _rows(rows: list[tuple[str, ...]] | list[list[str]], top: float, columns: tuple[float, ...]) -> Iterator[str]:
+def _rows(rows: Sequence[Sequence[str]], top: float, columns: tuple[float, ...]) -> Iterator[str]:
     for number, row in enumerate(rows):
         for at, words in zip(columns, row, strict=True):
             if words:

@@ -85,7 +85,8 @@ class LensPlate:
 
     def _off_mm(self, places_mm: Floats) -> Floats:
         """Return the distance of each place from the nearest vertex, (places,)."""
-        return np.sqrt(reduce(np.minimum, (((places_mm - centre) ** 2).sum(axis=1) for centre in self.centres_mm)))
+        squares = (((places_mm - centre) ** 2).sum(axis=1) for centre in self.centres_mm)
+        return np.asarray(np.sqrt(reduce(np.minimum, squares)))
 
     def _sag_mm(self, off_mm: Floats | float) -> Floats:
         return np.asarray(self.radius_mm - np.sqrt(self.radius_mm**2 - np.square(off_mm)))

@@ -66,7 +66,8 @@ def cut(part: Part, kind: str, offset: Offset = (0, 0, 0), at_x_mm: float = 0.0)
     if face.is_empty():
         return None
     svg = f'<path class="{kind}" d="{_area(face)}"/>'
-    return Drawn(svg, *face.bounds(), marks=tuple(_marks(face)))
+    left, low, right, high = face.bounds()
+    return Drawn(svg, left, low, right, high, marks=tuple(_marks(face)))
 
 
 def _marks(face: CrossSection) -> Iterator[Place]:

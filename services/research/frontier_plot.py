@@ -30,6 +30,11 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS, thum
     return stacked_svg(plots, [thumbnails] if thumbnails else [])
 
 
+def draw_heads(found: Sequence[Frontier]) -> str:
+    """Return the SVG of the frontiers of several heads: accuracy against time, one panel each."""
+    return stacked_svg([_time_plot(head, METHODS, drawn_points(head), {}) for head in found])
+
+
 def ringed(found: Frontier) -> tuple[PressPoint, ...] | tuple[Choice]:
     """Return the points with a ring: what a press does with each time budget; of a recorded frame the choice."""
     return found.presses or (found.choice,)

@@ -13,6 +13,7 @@ from device.errors import CalibrationError, HeadMismatch, MemoryDamaged
 from device.head import head_memory, refuse_unsuitable_calibration
 from device.ports import HeadMemory
 from device.values import HeadIdentity
+from services.research.named_files import head_file
 from services.research.reconstruct_file import parse_bayer
 from services.running_time import announced, say
 from services.workshop.calibration_words import details, printable, summary
@@ -22,7 +23,9 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 ArchiveOption = Annotated[Path, typer.Option("--archive", help="Where calibrations are kept.")]
-HeadOption = Annotated[Path | None, typer.Option(help="Head file; it must fit, and its memory is asked or written.")]
+HeadOption = Annotated[
+    Path | None, typer.Option(help="Head file or name; it must fit, and its memory is asked or written.")
+]
 IdArgument = Annotated[str, typer.Argument(metavar="ID", help="As `calibrations list` shows it.")]
 
 
@@ -78,7 +81,7 @@ def _put_in_force(archive: Archive, id: str, head: Path | None) -> str:
         found = archive.load(id)
         memory = None
         if head is not None:
-            spec = load_head(head)
+            spec = load_head(head_file(head))
             refuse_unsuitable_calibration(found, spec)
             memory = stack.enter_context(head_memory(spec, SystemClock()))
         activate(archive, found, memory)
@@ -171,7 +174,7 @@ def import_one(
     found = parse_calibration(files)
     kept = Archive(archive)
     if head is not None:
-        spec = load_head(head)
+        spec = load_head(head_file(head))
         refuse_unsuitable_calibration(found, spec)
         with head_memory(spec, SystemClock()) as memory:
             if memory is not None:

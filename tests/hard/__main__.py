@@ -23,13 +23,15 @@ def hard(
     ] = None,
     merged: Annotated[int, typer.Option(min=1, max=4, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
     drawn: Annotated[int, typer.Option(min=0, help="Of so many drawn eyes, instead of the three of the table.")] = 0,
+    lenslets: Annotated[bool, typer.Option("--lenslets", help="Of eyes behind lenslets, instead.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A few rows of one eye in large pixels, in a minute.")] = False,
     check: Annotated[bool, typer.Option("--check", help="The exit status is 1 if there is a violation.")] = False,
 ) -> None:
     """Run the grid of hard cases: every kind of bad frame through every method and the default schedule."""
     if quick:
         merged, case, method = grid.QUICK_MERGED, case or [*grid.QUICK], method or [*grid.QUICK_COLUMNS]
-    asked = grid.EYES[:1] if quick else grid.drawn_eyes(drawn) or grid.EYES
+    shown = grid.LENS_EYES if lenslets else grid.EYES
+    asked = shown[:1] if quick else grid.drawn_eyes(drawn) or shown
     eyes = tuple(replace(eye, merged=merged) for eye in asked)
     found = grid.run(eyes, case or (), tuple(method or COLUMNS), lambda line: typer.echo(line, err=True))
     grid.write(output, found)

@@ -25,6 +25,10 @@ EYES = (
     Eye("short-sighted eye, paper's sensor", "sim", {"sim.seed": 7, "sim.eye.m_dpt": 2.5}),
     Eye("long-sighted eye, IMX296", "imx296", {"sim.seed": 5, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}),
 )
+LENS_EYES = (
+    Eye("relaxed eye, lenslets", "imx296_lenslets", {"sim.seed": 5, "sim.peak_e": 8000.0}),
+    Eye("long-sighted eye, lenslets", "imx296_lenslets", {"sim.seed": 7, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}),
+)
 DRAWN_DPT = 4.0  # drawn eyes have a mean sphere between minus and plus that
 QUICK_MERGED, QUICK_COLUMNS = (
     4,

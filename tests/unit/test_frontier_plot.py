@@ -14,7 +14,7 @@ from PIL import Image as Pictures
 
 from device.recon.methods import METHODS
 from services.instrument.time_budget import PACES_S
-from services.research.frontier_plot import draw_frontier, drawn_points, ringed
+from services.research.frontier_plot import draw_frontier, draw_heads, drawn_points, ringed
 from services.research.frontier_result import (
     BestMu,
     Choice,
@@ -196,3 +196,11 @@ def test_a_spot_counts_as_visible_with_its_contrast_and_over_the_error():
     assert spots == 3
     assert counts[:4] == [3, 2, 0, 0]
     assert counts[4] < 3
+
+
+def test_heads_have_a_panel_each() -> None:
+    names = ("behind the diffuser", "behind lenslets", "behind one lens")
+    drawn = draw_heads([replace(measured(np.random.default_rng(seed)), scene=name) for seed, name in enumerate(names)])
+    titles = [text.text or "" for text in ElementTree.fromstring(drawn).iter(f"{SVG}text")]
+    assert [sum(name in title for title in titles) for name in names] == [1, 1, 1]
+    assert len(drawn) < LARGEST_BYTES

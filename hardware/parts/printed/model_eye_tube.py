@@ -3,6 +3,8 @@
 The eye's own coordinates: its lens's middle is the origin, z runs out of the eye, the retina is at -25 mm.
 """
 
+from math import sqrt
+
 from build123d import Part
 
 from hardware.parts.dimensions import Dimensions
@@ -20,7 +22,7 @@ def seat_z_mm(d: Dimensions) -> float:
     """Where the round lens lies on the shoulder's inner edge."""
     radius = d.bought.eye_lens_radius_mm
     half = SHOULDER_MM / 2
-    return d.bought.eye_lens_thick_mm / 2 - (radius - (radius**2 - half**2) ** 0.5)
+    return d.bought.eye_lens_thick_mm / 2 - (radius - sqrt(radius**2 - half**2))
 
 
 def pupil_z_mm(d: Dimensions) -> float:
