@@ -282,9 +282,10 @@ class Calibration:
 
     `psfs` has one entry or a stack over depth, for all colours or for each (`for_colour`); `dark_dn` (dark frame) and
     `flat` (flat frame) are (rows, cols) or None; `bad` marks defective pixels; `field_deg` is the diameter of the
-    illuminated disc around the centre (None: not known); `refraction_offset` is None if no trial lenses were shown,
-    `white` if no white card was. `source_in_focus`: by its stated distance the point source stood in the focus of the
-    model eye, and no earlier calibration contradicts (`calibration/procedure/refraction_zero.py`).
+    illuminated disc around the centre (None: not known); `soft_edge_deg` of a light that fades is the diameter at half
+    of it, and the full width of the ramp (None: a sharp edge); `refraction_offset` is None if no trial lenses were
+    shown, `white` if no white card was. `source_in_focus`: by its stated distance the point source stood in the focus
+    of the model eye, and no earlier calibration contradicts (`calibration/procedure/refraction_zero.py`).
     PsfError without PSFs or for PSFs of different shapes.
     """
 
@@ -299,6 +300,7 @@ class Calibration:
     refraction_offset: RefractionOffset | None = None
     white: WhiteReference | None = None
     source_in_focus: bool = False
+    soft_edge_deg: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.psfs:
@@ -331,7 +333,11 @@ class Calibration:
         digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
             digest.update(b"-" if array is None else repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-        for later in (self.refraction_offset, self.white):  # a calibration without them keeps its identity
+        for later in (
+            self.refraction_offset,
+            self.white,
+            self.soft_edge_deg,
+        ):  # a calibration without them keeps its identity
             if later is not None:
                 digest.update(repr(later).encode())
         if self.source_in_focus:

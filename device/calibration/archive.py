@@ -224,6 +224,7 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
         "refraction_offset": asdict(calibration.refraction_offset) if calibration.refraction_offset else None,
         "white": dict(calibration.white.dn_per_s) if calibration.white else None,
         "source_in_focus": calibration.source_in_focus or None,
+        "soft_edge_deg": calibration.soft_edge_deg,
         "provenance": table,
         "figures": dict(provenance.figures),
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in arrays.items()},
@@ -266,6 +267,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
             refraction_offset=_offset(manifest.get("refraction_offset")),
             white=_white(manifest.get("white")),
             source_in_focus=_BOOL.validate_python(manifest.get("source_in_focus", False)),
+            soft_edge_deg=_EDGE.validate_python(manifest.get("soft_edge_deg")),
             **{name: _checked_map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
         figures = tuple(manifest["figures"].items())
@@ -279,6 +281,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
 
 
 _BOOL = TypeAdapter(bool)
+_EDGE: TypeAdapter[tuple[float, float] | None] = TypeAdapter(tuple[float, float] | None)
 _NUMBERS = TypeAdapter(dict[str, float | None])
 _PROVENANCE = TypeAdapter(Provenance)
 _COLOUR: TypeAdapter[Colour] = TypeAdapter(Colour)

@@ -5,10 +5,11 @@ width of its dies; the matrix's are small, and its field keeps a sharp edge.
 """
 
 from functools import cache
+from math import acos, pi
 
 from device.config.head_file import InstrumentSpec
 from device.config.shipped_heads import LIGHT_PATH
-from device.optics.led_cap import LedCap, field_to_share_deg
+from device.optics.led_cap import LedCap, field_to_share_deg, half_maximum_deg
 from device.optics.light_path import LightPath, led_cap, load_light_path
 from device.optics.matrix import lamps_of
 from device.values import Colour
@@ -30,6 +31,20 @@ def picture_field_deg(spec: InstrumentSpec) -> float | None:
     if spec.optics is None or cap is None:
         return None if spec.optics is None else spec.optics.field_deg
     return max(spec.optics.field_deg, field_to_share_deg(cap, spec.optics.angular_magnification, EDGE_SHARE))
+
+
+def soft_edge_deg(spec: InstrumentSpec) -> tuple[float, float] | None:
+    """Return diameter and full width in degrees of the cosine ramp by which the light of a head fades; None: sharp.
+
+    It has half of the axis's irradiance at that diameter, and EDGE_SHARE at the edge of the picture's field.
+    """
+    cap = cap_of(spec)
+    if spec.optics is None or cap is None:
+        return None
+    magnification = spec.optics.angular_magnification
+    half_deg = half_maximum_deg(cap, magnification)
+    outward_deg = (field_to_share_deg(cap, magnification, EDGE_SHARE) - half_deg) / 2
+    return half_deg, outward_deg / (0.5 - acos(1 - 2 * EDGE_SHARE) / pi)
 
 
 def has_sharp_edge(spec: InstrumentSpec) -> bool:

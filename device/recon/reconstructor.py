@@ -56,7 +56,7 @@ from device.recon.model.kernels import Pixels, Places
 from device.recon.model.resampling import to_sensor
 from device.recon.model.spots import without_noise
 from device.recon.stage import QuickLook, Recipe, Stage, StageResult, Step, default_schedule
-from device.values import Calibration, Image, Reconstruction, RefractionOffset, Report
+from device.values import Calibration, Image, Reconstruction, Report
 
 Check = Future[Consistency | None]
 
@@ -488,7 +488,7 @@ class Reconstructor:
         snr = light_over_noise(run.solved.frame.mean_dn, noise_dn, self.shape) if self.calibration.geometry else None
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience, snr)
         explained = not dark and is_explained(quality, match, misfit)
-        eye = _reported_refraction(run.refraction, explained and is_lit(quality), self.calibration.refraction_offset)
+        eye = _reported_refraction(run.refraction, explained, quality, self.calibration)
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }
@@ -548,12 +548,17 @@ def _solve_behind_pupil(
 
 
 def _reported_refraction(
-    eye: Refraction | NoRefraction | None, explained: bool, offset: RefractionOffset | None
+    eye: Refraction | NoRefraction | None, explained: bool, quality: dict[str, float | None], calibration: Calibration
 ) -> Refraction | NoRefraction | None:
-    """Return the refraction that the report states: corrected, or refused for a frame that is not explained."""
-    if eye is not None and not explained:
+    """Return the refraction that the report states: corrected, or refused for a frame that is not explained.
+
+    A field that is too dark shows no edge, and no refraction; behind lenslets any part of it shows the spots.
+    """
+    geometry = calibration.geometry
+    has_spots = geometry is not None and geometry.lens_focus_dpt is not None
+    if eye is not None and not (explained and (has_spots or is_lit(quality))):
         return NoRefraction("the forward model does not explain the frame")
-    return corrected(eye, offset) if isinstance(eye, Refraction) else eye
+    return corrected(eye, calibration.refraction_offset) if isinstance(eye, Refraction) else eye
 
 
 def _flicker_of_rows(finder: FlickerFinder, run: FrameRun) -> dict[str, float]:

@@ -26,7 +26,7 @@ from device.config.image_files import (
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import CameraMissing, FrameError, SpecError
-from device.optics.lit_angle import picture_field_deg
+from device.optics.lit_angle import picture_field_deg, soft_edge_deg
 from device.sim.light import LampContext
 from device.user_files import files_in
 from device.values import Calibration, Counts, ExposureSettings, Frame, Illumination, Image, Mask, Psf, Sensor
@@ -216,6 +216,7 @@ def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibrat
         sensor=Sensor(black_dn=camera.black_dn, white_dn=camera.white_dn),
         geometry=geometry,
         field_deg=picture_field_deg(spec),
+        soft_edge_deg=soft_edge_deg(spec),
         flat=flat,
         bad=camera.bad,
     )

@@ -6,7 +6,7 @@ from device.config.scene import ElementFlaws
 from device.optics import lenslets
 from device.optics.diffuser import Refraction, steepest_rad
 from device.optics.eye import correction_dpt
-from device.optics.lit_angle import picture_field_deg
+from device.optics.lit_angle import picture_field_deg, soft_edge_deg
 from device.sim.effects.sensor import hot_pixels
 from device.sim.optical_setup import OpticalSetup
 from device.sim.render import convolved_with_disc, crop_or_pad, psf
@@ -43,6 +43,7 @@ def simulated_calibration(world: World) -> Calibration:
         field_deg=picture_field_deg(world.spec),
         simulated=True,
         source_in_focus=True,
+        soft_edge_deg=soft_edge_deg(world.spec),
     )
 
 

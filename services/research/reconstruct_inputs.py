@@ -31,7 +31,7 @@ from device.config.image_files import (
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError, SettingError, SpecError
-from device.optics.lit_angle import picture_field_deg
+from device.optics.lit_angle import picture_field_deg, soft_edge_deg
 from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels
@@ -384,6 +384,7 @@ def load_calibrations(
             flat=_plane(flat, c),
             bad=raw.bad,
             simulated=simulated,
+            soft_edge_deg=None if spec is None or options.field_deg is not None else soft_edge_deg(spec),
         )
         for c, stack in enumerate(psfs.stacks if loaded.bayer is None else _for_three(psfs.stacks))
     )

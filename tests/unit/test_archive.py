@@ -29,6 +29,7 @@ def calibration(black_dn: float = 64.25) -> Calibration:
         flat,
         flat > 1.09,
         True,
+        soft_edge_deg=(30.2, 21.8),
     )
 
 
@@ -45,6 +46,7 @@ def test_a_stored_calibration_is_loaded_unchanged(archive):
     assert found.provenance == WHO
     assert [(psf.name, psf.colour) for psf in found.calibration.psfs] == [("0 dpt", None), ("2 dpt", "red")]
     assert found.calibration.simulated
+    assert found.calibration.soft_edge_deg == (30.2, 21.8)
     assert np.array_equal(found.calibration.bad, expected.bad)
     assert not found.calibration.flat.flags.writeable
 

@@ -10,6 +10,7 @@ from device.config.head_file import load_head
 from device.light_safety.hazard import light_limits
 from device.optics.led_cap import LedCap, centre_over_mean, dark_deg, half_maximum_deg, relative_irradiance, seen_share
 from device.optics.light_path import load_light_path
+from device.optics.lit_angle import soft_edge_deg
 from hardware.parts.dimensions import Fits, dimensions
 from services.workshop.light_report import expected_beam, limit_shares
 from services.workshop.light_tolerances import tolerances
@@ -44,6 +45,16 @@ def test_a_point_of_light_has_a_sharp_edge_at_the_field() -> None:
     even = centre_over_mean(point, RELAY, 33.4)
     # Lambert's power in the cone, sin^2, spread over the disc, against the intensity on the axis.
     assert even == pytest.approx(RELAY**2 * tan(radians(16.7)) ** 2 / sin(radians(12.525)) ** 2, rel=0.01)
+
+
+def test_a_cosine_ramp_describes_the_soft_edge_of_the_high_power_ring() -> None:
+    edge = soft_edge_deg(load_head(HARDWARE / "heads" / "imx296_power.toml"))
+    assert edge is not None
+    diameter_deg, width_deg = edge
+    off_deg = np.arange(0.0, 27.0)
+    place = np.clip((diameter_deg / 2 - off_deg) / width_deg + 0.5, 0, 1)
+    assert 0.5 - 0.5 * np.cos(pi * place) == pytest.approx(relative_irradiance(CAP, RELAY, off_deg), abs=0.06)
+    assert soft_edge_deg(load_head(HARDWARE / "heads" / "imx296.toml")) is None
 
 
 def test_penumbra_of_the_high_power_ring_is_that_of_an_independent_trace() -> None:

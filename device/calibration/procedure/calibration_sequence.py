@@ -35,7 +35,7 @@ from device.calibration.procedure.step_exposures import SHORTEST_S, StepExposure
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationError, CalibrationRefused
-from device.optics.lit_angle import picture_field_deg
+from device.optics.lit_angle import picture_field_deg, soft_edge_deg
 from device.ports import Camera, Thermometer
 from device.recon.model.spots import find_spots
 from device.values import Calibration, Colour, Frame, Geometry, Psf, Sensor
@@ -349,6 +349,7 @@ class CalibrationSequence:
             sensor=sensor,
             geometry=geometry,
             field_deg=picture_field_deg(spec),
+            soft_edge_deg=soft_edge_deg(spec),
             dark_dn=darks.map_dn,
             flat=flats.response,
             bad=darks.hot | flats.dead,

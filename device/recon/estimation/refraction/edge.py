@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from device.recon.estimation.background import SensorPolynomial, without
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import InterpolatedOtf, transform
-from device.recon.estimation.refraction.field import MARGIN_DEG, Edge, EdgePrior, FieldEdge, LitField
+from device.recon.estimation.refraction.field import Edge, EdgePrior, FieldEdge, LitField
 from device.recon.estimation.refraction.likelihood import (
     Band,
     BandLikelihood,
@@ -92,13 +92,14 @@ class EdgeLikelihood:
     ) -> None:
         assert calibration.field_deg is not None
         self._count = 0 if edge_is_known else PARAMETERS
-        wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
+        diameter_deg, width_deg = calibration.soft_edge_deg or (calibration.field_deg, None)
+        wide = replace(calibration, field_deg=2 * EdgePrior(diameter_deg, width_deg, 1.0).largest_samples)
         otf = InterpolatedOtf(calibration.psfs[index])
         sample_um = SAMPLE_UM if geometry.lens_focus_dpt is None else SPOT_SAMPLE_UM
         self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, otf, sample_um)
         self.grid = self.likelihood.grid
         self.band: Band = self.likelihood.bands.whole
-        self.prior = EdgePrior(calibration.field_deg, geometry.px_per_deg / self.grid.n)
+        self.prior = EdgePrior(diameter_deg, width_deg, geometry.px_per_deg / self.grid.n)
         self.edge = self.prior.calibrated
         self.field = LitField(self.grid, self.edge, self.prior.largest_samples)
         self._sampled: SampledFrame
@@ -213,10 +214,13 @@ class EdgeLikelihood:
         return replace(candidate, nats=candidate.nats + float(penalty @ (away + step) ** 2), step=step)
 
     def move_edge(self, step: Floats) -> float:
-        """Move the first parameters of the edge by `step` (samples), within their range; return the largest change."""
+        """Move the first parameters of the edge by `step` (samples), within their range; return the largest change.
+
+        That of a soft edge is divided by its softness.
+        """
         before = self.edge
         self.edge = self.prior.moved(self.edge, step)
-        return float(np.abs(self.edge.vector - before.vector).max())
+        return float(np.abs(self.edge.vector - before.vector).max()) / self.prior.softness
 
     def field_edge(self, model: EdgeModel | None) -> FieldEdge:
         """Return the present edge in degrees; the sd of its diameter is from `matrix`, half the information."""

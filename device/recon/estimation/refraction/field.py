@@ -22,6 +22,7 @@ MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radi
 FIRST_WIDTH_DEG = 0.4  # of the first model: a step has no derivative with respect to its width
 PRIOR_DEG = (0.5, 0.2, 0.2, 1.0)  # sqrt(2) sd of radius, centre (down, right) and width around the calibrated edge
 LARGEST_STEP_DEG = 0.3  # of one iteration: the linear model holds within the structure of the caustic
+SOFT_WIDTH_DEG = 9.0  # from this width on uncertainty and range of an edge grow in proportion to its width
 MIN_WEIGHT = 0.03  # of the brightest block, added for the read noise
 
 Floats = NDArray[np.float64]
@@ -83,20 +84,23 @@ class FieldEdge:
 
 
 class EdgePrior:
-    """Expected edge with its uncertainty and range, for a field in degrees and a scale in samples per degree.
+    """Expected edge with its uncertainty and range, for diameter and width in degrees, and samples per degree.
 
     `calibrated` is the edge of the calibration, `expected` the first edge of a frame (at first the same), `precision`
     half the inverse variance of each parameter around it, as in a negative log likelihood, and `largest_samples` the
-    largest radius.
+    largest radius with light.
     """
 
-    def __init__(self, field_deg: float, per_deg: float) -> None:
+    def __init__(self, diameter_deg: float, width_deg: float | None, per_deg: float) -> None:
         self._per_deg = per_deg
-        self._reach = MARGIN_DEG * per_deg
-        self.calibrated = Edge(field_deg / 2 * per_deg, 0.0, 0.0, FIRST_WIDTH_DEG * per_deg)
+        width = (width_deg or FIRST_WIDTH_DEG) * per_deg
+        self.softness = max(1.0, (width_deg or 0.0) / SOFT_WIDTH_DEG)
+        self._reach = MARGIN_DEG * per_deg * self.softness
+        self._widest = 2 * self._reach if width_deg is None else 1.5 * width
+        self.calibrated = Edge(diameter_deg / 2 * per_deg, 0.0, 0.0, width)
         self.expected = self.calibrated
-        self.precision: Floats = (np.asarray(PRIOR_DEG) * per_deg) ** -2
-        self.largest_samples = self.calibrated.radius_samples + self._reach
+        self.precision: Floats = (np.asarray(PRIOR_DEG) * (self.softness, 1, 1, self.softness) * per_deg) ** -2
+        self.largest_samples = self.calibrated.radius_samples + self._reach + (width / 2 if width_deg else 0.0)
 
     def around(self, edge: Edge) -> "EdgePrior":
         """Return the prior with another expected edge."""
@@ -107,11 +111,11 @@ class EdgePrior:
     def moved(self, edge: Edge, step: Floats) -> Edge:
         """Return an edge whose first parameters are moved by `step` (samples), within their range."""
         wanted = edge.vector
-        largest = LARGEST_STEP_DEG * self._per_deg
+        largest = LARGEST_STEP_DEG * self._per_deg * self.softness
         wanted[: step.size] += np.clip(step, -largest, largest)
         middle = self.expected.vector[:3]
         radius, down, right = np.clip(wanted[:3], middle - self._reach, middle + self._reach).tolist()
-        return Edge(radius, down, right, float(np.clip(wanted[3], 1.0, 2 * self._reach)))
+        return Edge(radius, down, right, float(np.clip(wanted[3], 1.0, self._widest)))
 
     def is_at_end(self, edge: Edge) -> bool:
         """Return True if radius or centre of the edge are at the end of their range."""
