@@ -15,7 +15,7 @@ from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.kernels import Places
 from device.recon.model.preprocessing import Linear, Preprocessor
-from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, working_bin
+from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, STOPBAND_SHARE_SPOTS, working_bin
 from device.recon.solvers.solver import Diagnostics, Solver
 from device.values import Calibration, Image, Reconstruction
 
@@ -124,7 +124,10 @@ def default_schedule(calibration: Calibration, shape: tuple[int, int], index: in
     has at least 64 samples; the first uses twice that bin, or the same if the side would have fewer than 16.
     """
     is_open = isinf(field_radius_px(calibration))
-    n = working_bin(calibration.psfs[index], STOPBAND_SHARE_OPEN if is_open else STOPBAND_SHARE)
+    geometry = calibration.geometry
+    has_spots = geometry is not None and geometry.lens_focus_dpt is not None
+    known = STOPBAND_SHARE_SPOTS if has_spots else STOPBAND_SHARE
+    n = working_bin(calibration.psfs[index], STOPBAND_SHARE_OPEN if is_open else known)
     while n > 1 and min(shape) // n < 64:
         n -= 1
     coarse = 2 * n if min(shape) // (2 * n) >= 16 else n

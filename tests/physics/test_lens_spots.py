@@ -15,6 +15,7 @@ from device.optics import lenslets
 from device.optics.diffuser import Refraction
 from device.recon.estimation.psf_warp import transform, warped
 from device.recon.model.spots import GAP_LIGHT, Spots, find_spots, without_noise
+from device.recon.stage import default_schedule
 from device.sim.plan import decide
 from device.sim.render import convolved_with_disc
 from device.values import Calibration, Geometry, Image, Psf, Sensor
@@ -99,6 +100,15 @@ def test_noise_between_the_spots_is_left_out_and_the_spots_stay() -> None:
     calibration = Calibration((psf,), Sensor(), geometry())
     assert correlation(psf, clean) < 0.98
     assert correlation(without_noise(calibration).psfs[0], clean) > 0.998
+
+
+@pytest.mark.parametrize(("pitch_um", "n"), [(3.45, 2), (6.9, 1)])
+def test_a_sample_behind_lenslets_is_as_wide_as_the_spots_permit(pitch_um: float, n: int) -> None:
+    """At the light of an eye finer samples cost nine times the time and detail (NUMERICS.md 7.11)."""
+    scale = optics().geometry(pitch_um)
+    calibration = Calibration((Psf(lenslets.spots(optics(), pitch_um, 1)),), Sensor(), scale, field_deg=33.4)
+    _, full = default_schedule(calibration, (1088, 1456))
+    assert full.bin == n
 
 
 def test_psf_of_a_diffuser_stays_as_it_is() -> None:

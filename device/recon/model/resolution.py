@@ -10,6 +10,7 @@ from device.values import Psf
 
 STOPBAND_SHARE = 1e-3  # of the maximum ring mean of |H|^2; in amplitude 1/30 of the maximum
 STOPBAND_SHARE_OPEN = 5e-3  # for an inaccurate PSF; twice this value changes one of three recordings, from bin 4 to 5
+STOPBAND_SHARE_SPOTS = 0.08  # of lenslets: beyond, detail is noise at the light of an eye (NUMERICS.md 7.11)
 LARGEST = 8
 EDGES = np.linspace(0, 0.5, 65)  # of the rings, in cycles per pixel
 
@@ -19,7 +20,8 @@ def working_bin(psf: Psf, empty: float = STOPBAND_SHARE) -> int:
 
     Frequencies beyond the last ring whose mean |H|^2 exceeds `empty` times its maximum carry no information at the
     light levels of a retina. The caustic of the paper ends near 40 cycles/mm, so its 5 um pixels can be binned 2 x 2,
-    those of an IMX296 3 x 3. A PSF with fewer than 32 rows or columns gives n = 1.
+    those of an IMX296 3 x 3; behind lenslets, whose |H|^2 has no end, 2 x 2 (NUMERICS.md 7.11). A PSF with fewer than
+    32 rows or columns gives n = 1.
     """
     rows, cols = psf.shape
     if min(rows, cols) < 32:
