@@ -13,7 +13,7 @@ from math import log
 import numpy as np
 
 from device.clock import Deadline
-from device.errors import FrameError
+from device.errors import FrameError, SettingError
 from device.recon.assessment.quality_figures import is_banded
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame, require_light
 from device.recon.corrections import is_steadier, with_corrections
@@ -59,14 +59,21 @@ class BurstReconstructor:
     Parameters
     ----------
     single
-        Reconstructor of the joined frame, of quick looks and of pictures of one frame.
+        Reconstructor of the joined frame, of quick looks and of pictures of one frame, with two stages at least.
     planner
         Planner of the FFTs.
     timed
         True: measure the costs of the steps on noise, for deadlines.
+
+    Raises
+    ------
+    SettingError
+        `single` has one stage, which is that of the first frame: the joined frame would not be solved.
     """
 
     def __init__(self, single: Reconstructor, planner: Planner, *, timed: bool = True) -> None:
+        if len(single.stages) < 2:
+            raise SettingError("a burst needs a quick look before its picture", "Give two recipes, or none.")
         calibration = single.calibration
         shape = single.shape
         index = single.psf_index

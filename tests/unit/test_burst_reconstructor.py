@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from device.clock import Deadline, SystemClock
-from device.errors import FrameError
+from device.errors import FrameError, SettingError
 from device.recon.burst_reconstructor import NO_TIME, NOT_SOLVED, BurstReconstructor
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor
-from device.recon.stage import RoundDone, StageResult
+from device.recon.stage import Recipe, RoundDone, StageResult
 from device.values import Image, Reconstruction
 from tests.moving_retina import (
     DRIFT_PX,
@@ -62,6 +62,12 @@ def test_a_burst_gives_one_quick_look_pauses_and_one_better_picture(bursts: Burs
     assert psnr_db(made.picture, truth()) > psnr_db(alone.picture, truth()) + 0.7
     assert [use.used for use in made.report.frames] == [True] * COUNT
     assert made.report.seconds["join"] > 0
+
+
+def test_one_stage_would_solve_the_first_frame_alone_and_is_refused() -> None:
+    single = Reconstructor(burst_calibration(), SHAPE, PLANNER, SystemClock(), (Recipe("variation", 2),), timed=False)
+    with pytest.raises(SettingError, match="quick look"):
+        BurstReconstructor(single, PLANNER)
 
 
 def test_a_burst_is_in_dn_of_one_exposure(bursts: BurstReconstructor, frames: list) -> None:
