@@ -142,7 +142,7 @@ def test_spots_of_a_wider_point_source_than_stated_are_told_from_those_of_lenses
     wide, narrow = (Psf(convolved_with_disc(seen().pixels, um / PITCH_UM)) for um in (48, 9))
     lenses = optics().element.lenses
     assert list(lens_messages(lens_figures(found(narrow), lenses, None))) == []
-    assert "width of the point source" in " ".join(lens_messages(lens_figures(found(wide), lenses, None)))
+    assert "see whether the point source is at most" in " ".join(lens_messages(lens_figures(found(wide), lenses, None)))
 
 
 def without_spot(psf: Psf, lens: tuple[float, float, float]) -> Psf:
