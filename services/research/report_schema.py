@@ -39,7 +39,7 @@ REFRACTION: Mapping[str, str] = {
     "sphere_sc": "Sphere of the sphere-cylinder notation in dpt: M - cylinder/2.",
     "cylinder": "Minus cylinder in dpt.",
     "axis_deg": "Axis of the cylinder in TABO degrees, above 0 and up to 180, as the examiner sees the eye.",
-    "field_deg": "Diameter of the lit field that was found with the refraction, in degrees.",
+    "field_deg": "Diameter of the lit field that was found with the refraction, in degrees; of a fading light at half.",
     "field_deg_sd": "Standard deviation of `field_deg` in degrees; 0 for a field that was held.",
     "zero": (
         "Origin of the zero of `sphere`, `j0` and `j45`: `trial lens`, `point source` (its stated distance in the "

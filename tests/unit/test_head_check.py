@@ -1,6 +1,7 @@
 """Tests of the calibration checks: a fitting calibration raises no alarm, a wrong one is found within stated limits."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from itertools import product
@@ -253,16 +254,17 @@ def test_the_scale_check_needs_many_patients() -> None:
 # Field edge over several patients
 
 
-def edge(off_deg: float, sd_deg: float, eyes: int, minutes: int = 60) -> Finding | None:
+def edge(off_deg: float, sd_deg: float, eyes: int, minutes: int = 60, soft: bool = False) -> Finding | None:
     """Return the finding on the edge after `eyes` captures with a field off by `off_deg` and a scatter of 0.1 deg."""
-    field_deg = calibrated().field_deg
+    calibration = replace(calibrated(), soft_edge_deg=(30.2, 21.8) if soft else None)
+    field_deg = calibration.field_deg
     assert field_deg is not None
     found_deg = field_deg + off_deg + np.random.default_rng(2).normal(0, 0.1, eyes)
     refractions = [
         ReportedRefraction(NOW + timedelta(minutes=minutes * n), 0.0, float(edge_deg), sd_deg)
         for n, edge_deg in enumerate(found_deg)
     ]
-    findings = head_check.check(calibrated(), KNOWN, (), refractions, NOW)
+    findings = head_check.check(calibration, KNOWN, (), refractions, NOW)
     return next((finding for finding in findings if finding.name == "edge"), None)
 
 
@@ -288,6 +290,7 @@ def test_the_edge_check_needs_several_eyes_with_an_estimated_edge() -> None:
     assert edge(1.0, 0.1, 4) is None
     assert edge(1.0, 0.1, 20, minutes=1) is None  # one sitting
     assert edge(1.0, 0.0, 20) is None  # the edge was given, not estimated
+    assert edge(-13.0, 1.5, 20, soft=True) is None  # half of a light that fades, moved by the shading of the retina
 
 
 # Age and mode

@@ -135,8 +135,9 @@ def check(
     if len(sittings) >= MIN_SITTINGS:
         found.append(_scale_finding([median(refraction.m_dpt for refraction in sitting) for sitting in sittings]))
     measured = [refraction for refraction in refractions if refraction.field_deg_sd > 0]
-    if calibration.field_deg is not None and len(eyes := _sittings(measured)) >= MIN_EDGE_SITTINGS:
-        found.append(_edge_finding(calibration.field_deg, eyes))
+    sharp_deg = None if calibration.soft_edge_deg else calibration.field_deg  # shading of a retina moves a soft edge
+    if sharp_deg is not None and len(eyes := _sittings(measured)) >= MIN_EDGE_SITTINGS:
+        found.append(_edge_finding(sharp_deg, eyes))
     if recent:
         found += _dark_findings(calibration, [assessment.dark for assessment in recent[-RECENT_CAPTURES:]])
     return tuple(found)
