@@ -26,10 +26,12 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+from services.identity.users import FOLDER, ROLES, UserTable
 from tests.bench import timing
 from tests.bench.attackers import ATTACKS, REOPEN_S, under_attack
 
 ROOT = Path(__file__).parents[2]
+PIN = "274913"
 DEFAULT_FILES = 1024  # soft limit of systemd for a unit without LimitNOFILE
 STATUS_S, PRESS_S, LOG_MB_PER_MIN = 0.2, 1.5, 1.0
 ASK_EVERY_S, PRESS_EVERY_S, TIMEOUT_S = 0.25, 2.0, 15.0
@@ -47,10 +49,14 @@ class Seen:
 
 
 class Instrument:
-    """`diffuscope run` of one tree with the simulated head, at the open files of its unit."""
+    """`diffuscope run` of one tree with the simulated head, at the open files of its unit.
 
-    def __init__(self, tree: Path, data: Path) -> None:
-        self._tree, self._data, self._log = tree, data, data.with_suffix(".log")
+    `is_open`: served to the whole network, so for a user who signs in; else for the demonstration user.
+    """
+
+    def __init__(self, tree: Path, data: Path, is_open: bool = False) -> None:
+        self._tree, self._data, self._log, self._is_open = tree, data, data.with_suffix(".log"), is_open
+        self._cookie = ""
         self.files = unit_files(tree)
         with socket.socket() as probe:
             probe.bind(("", 0))
@@ -59,7 +65,11 @@ class Instrument:
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[bytes]]:
         """Run the server until the end of the context, from the moment on when it accepts a press."""
-        words = ["run", "--head", "hardware/heads/sim.toml", "--host", "0.0.0.0", "--port", str(self.port)]
+        host = "0.0.0.0" if self._is_open else "127.0.0.1"
+        words = ["run", "--head", "hardware/heads/sim.toml", "--host", host, "--port", str(self.port)]
+        users = UserTable(self._data / FOLDER)
+        if self._is_open and not users.has_begun:
+            users.add("Asha", PIN, ROLES)
         command = [str(self._tree / ".venv/bin/diffuscope"), *words, "--data", str(self._data)]
         with self._log.open("wb") as log:
             process = subprocess.Popen(command, cwd=self._tree, stdout=log, stderr=log, preexec_fn=self._limit_files)
@@ -69,6 +79,8 @@ class Instrument:
                 assert process.poll() is None, self._log.read_text()
                 assert time.monotonic() < end_s, self._log.read_text()
                 time.sleep(0.5)
+            if self._is_open:
+                self.ask("POST", "/api/login", {"name": "Asha", "secret": PIN})
             yield process
         finally:
             process.terminate()
@@ -77,11 +89,12 @@ class Instrument:
     def ask(self, method: str, path: str, body: Any = None) -> Any:
         """Send one request on a connection of its own; return the answer. OSError for no answer or another status."""
         content = None if body is None else json.dumps(body)
-        headers = {"Content-Type": "application/json", "Connection": "close"}
+        headers = {"Content-Type": "application/json", "Connection": "close", "Cookie": self._cookie}
         with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)) as connection:
             connection.request(method, path, content, headers)
             answer = connection.getresponse()
             read = answer.read()
+        self._cookie = (answer.headers.get("Set-Cookie") or self._cookie).partition(";")[0]
         if answer.status not in (200, 201):
             raise OSError(f"status {answer.status}")
         return json.loads(read)
@@ -110,7 +123,7 @@ def main() -> int:
     words = parser.parse_args()
     sources = {"own": "127.0.0.1", "other": own_address()}
     with tempfile.TemporaryDirectory() as folder:
-        instrument = Instrument(words.tree.resolve(), Path(folder) / "data")
+        instrument = Instrument(words.tree.resolve(), Path(folder) / "data", is_open=True)
         with instrument.running() as process:
             print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {instrument.files} open files")
             columns = ("requests", "failed", "opening", "status", "press", "MB/min", "MB", "threads", "files", "limit")
