@@ -1,7 +1,7 @@
 """Accuracy against time of the simulated head on this computer, as the page shows it at first: `make frontier`.
 
 Writes the measurement and its plot, which README shows, to `services/instrument/simulated_frontier`, and a panel for
-each element at the light of a human eye to `hardware/pictures/frontier-elements.svg`. Measure on an idle computer.
+each element at the light of a human eye to `hardware/pictures`. Measure on an idle computer.
 """
 
 from pathlib import Path
