@@ -29,7 +29,7 @@ SPOT_SEARCHES = 4
 MIN_SPOTTED = 0.9  # rms residual beyond which spots are searched for: noise has 0.85 to 1.01, faint spots to 1.03
 GHOST_SEARCHES = 4
 GHOST_BETTER = 0.997  # of the residual: a ghost of 10 % 0.959 to 0.993, noise of columns 0.999
-GHOST_FALL = 0.05  # of the residual over the share: ghosts 0.07 to 0.2, what lenslets leave beyond the field 0.017
+SPOT_GHOST_FALL = 0.05  # behind lenslets, of the residual over the share: what they leave beyond the field 0.017
 MIN_SHARE, MAX_SHARE = 0.01, 0.8  # of the light of the first image
 MIN_GHOST = 0.035  # of it: in stray light of 20 % one of 0.025 was found that is none; less costs no picture
 GHOST_FALLS = 0.25  # of the trace of a ghost: less is left of one that is taken out
@@ -136,6 +136,7 @@ class Corrections:
     ) -> None:
         self.flicker = FlickerFinder(dark_dn, calibration.sensor.white_dn)
         self._white_dn = calibration.sensor.white_dn
+        self._has_spots = calibration.geometry is not None and calibration.geometry.lens_focus_dpt is not None
         self._shape = shape
         self._dark_dn = dark_dn
         self._solve = solve
@@ -216,7 +217,7 @@ class Corrections:
             tried.append(again)
             left = _trace(again.run, ghost)
             if abs(left) < GHOST_FALLS * whole_trace:
-                most = min(GHOST_BETTER, 1 - GHOST_FALL * light.share)
+                most = min(GHOST_BETTER, 1 - SPOT_GHOST_FALL * light.share) if self._has_spots else GHOST_BETTER
                 is_better = light.share >= MIN_GHOST and _falls(whole, again, most)
                 if not is_better or states_misfit(again.made.report.warnings):
                     break

@@ -326,7 +326,8 @@ def shape(folder: Path) -> dict[str, Any]:
     with closing(sqlite3.connect(folder / "data" / "store.sqlite")) as tables:
         every = tables.execute("SELECT name FROM sqlite_schema WHERE type = 'table' ORDER BY name").fetchall()
         rows = {name: _rows(tables, name) for (name,) in every if not name.startswith("sqlite_")}
-    return numbered({"tables": rows, "files": names})
+    found = numbered({"tables": rows, "files": names})
+    return found | {"files": sorted(found["files"])}  # ids of calibrations are digests, and have no order of their own
 
 
 def _rows(tables: sqlite3.Connection, name: str) -> list[dict[str, Any]]:
