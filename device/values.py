@@ -222,6 +222,11 @@ class Geometry:
     lens_index: float | None = field(default=None, repr=False)
 
     @property
+    def has_spots(self) -> bool:
+        """Whether lenslets stand in the diffuser's place, so that the PSF is one spot for each."""
+        return self.lens_focus_dpt is not None
+
+    @property
     def px_per_deg(self) -> float:
         """Sensor pixels per degree of field at the eye (small angle, as in the paper's s = a f_d theta / 2)."""
         return self.angular_magnification * self.diffuser_to_sensor_um * float(np.pi) / 180 / self.pitch_um
@@ -320,6 +325,11 @@ class Calibration:
         return replace(self, psfs=own or every or self.psfs[:1])
 
     @property
+    def has_spots(self) -> bool:
+        """Whether the PSF is one spot for each of the lenslets; False without a geometry."""
+        return self.geometry is not None and self.geometry.has_spots
+
+    @property
     def refraction_zero(self) -> RefractionZero:
         """Origin of the zero of refractions: trial lenses, the point source, or "relative": nothing fixes it."""
         if self.refraction_offset is not None:
@@ -333,11 +343,8 @@ class Calibration:
         digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
             digest.update(b"-" if array is None else repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-        for later in (
-            self.refraction_offset,
-            self.white,
-            self.soft_edge_deg,
-        ):  # a calibration without them keeps its identity
+        # A calibration without them keeps its identity.
+        for later in (self.refraction_offset, self.white, self.soft_edge_deg):
             if later is not None:
                 digest.update(repr(later).encode())
         if self.source_in_focus:

@@ -136,7 +136,7 @@ class Corrections:
     ) -> None:
         self.flicker = FlickerFinder(dark_dn, calibration.sensor.white_dn)
         self._white_dn = calibration.sensor.white_dn
-        self._has_spots = calibration.geometry is not None and calibration.geometry.lens_focus_dpt is not None
+        self._has_spots = calibration.has_spots
         self._shape = shape
         self._dark_dn = dark_dn
         self._solve = solve

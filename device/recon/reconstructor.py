@@ -554,9 +554,7 @@ def _reported_refraction(
 
     A field that is too dark shows no edge, and no refraction; behind lenslets any part of it shows the spots.
     """
-    geometry = calibration.geometry
-    has_spots = geometry is not None and geometry.lens_focus_dpt is not None
-    if eye is not None and not (explained and (has_spots or is_lit(quality))):
+    if eye is not None and not (explained and (calibration.has_spots or is_lit(quality))):
         return NoRefraction("the forward model does not explain the frame")
     return corrected(eye, calibration.refraction_offset) if isinstance(eye, Refraction) else eye
 

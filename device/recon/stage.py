@@ -124,9 +124,7 @@ def default_schedule(calibration: Calibration, shape: tuple[int, int], index: in
     has at least 64 samples; the first uses twice that bin, or the same if the side would have fewer than 16.
     """
     is_open = isinf(field_radius_px(calibration))
-    geometry = calibration.geometry
-    has_spots = geometry is not None and geometry.lens_focus_dpt is not None
-    known = STOPBAND_SHARE_SPOTS if has_spots else STOPBAND_SHARE
+    known = STOPBAND_SHARE_SPOTS if calibration.has_spots else STOPBAND_SHARE
     n = working_bin(calibration.psfs[index], STOPBAND_SHARE_OPEN if is_open else known)
     while n > 1 and min(shape) // n < 64:
         n -= 1

@@ -6,6 +6,7 @@ calibration the mean of noisy frames: no code of `device/optics` or `device/sim`
 
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ def scored(calibration: Calibration, counts: Counts, truth: Image) -> tuple[Scor
     found = made.report.refraction_dpt
     assert found is not None
     assert found["refused"] is None
-    eye = [sign * float(found[name]) for name, sign in SIGNS.items()]  # type: ignore[arg-type]
+    eye = [sign * cast(float, found[name]) for name, sign in SIGNS.items()]
     return PictureScorer(truth, inside, DETAIL_DEG * px_per_deg)(made.picture), eye
 
 

@@ -33,7 +33,7 @@ def test_a_user_is_found_by_name_and_secret_and_by_nothing_else(users: UserTable
     found = users.verify(" ravi kumar ", PASSPHRASE)
     assert found is not None
     assert (found.name, found.roles) == ("Ravi Kumar", {"reader"})
-    for name, secret in (("Ravi Kumar", PIN), ("Asha", PASSPHRASE), ("Nobody", PIN), ("Asha", "")):
+    for name, secret in (("Ravi Kumar", PIN), ("Asha", PASSPHRASE), ("Unknown", PIN), ("Asha", "")):
         assert users.verify(name, secret) is None
     content = (tmp_path / "access/users.json").read_text()
     assert PASSPHRASE not in content

@@ -55,7 +55,7 @@ function view({ log, error }, filter) {
 
 const list = (entries) => html`<ul class="audit">
   ${entries.map((entry) => html`<li>
-    <b>${entry.user || t("audit.nobody")}</b> ${entry.action} ${entry.record}
+    <b>${entry.user || t("audit.anonymous")}</b> ${entry.action} ${entry.record}
     <small>${entry.number} · ${when(entry.at)} · ${Object.values(entry.more).join(" · ")}</small>
   </li>`)}
 </ul>`;

@@ -118,8 +118,7 @@ class CropRefinement:
                 break
         self._edges.fit_smooth(eye_dpt)
         rim_sd = dark_rim(self._edges, eye_dpt, fit, self._psf_radius_px)
-        has_spots = self._edges.likelihood.geometry.lens_focus_dpt is not None
-        model_sd_dpt = SPOT_MODEL_SD_DPT if has_spots else MODEL_SD_DPT
+        model_sd_dpt = SPOT_MODEL_SD_DPT if self._edges.likelihood.geometry.has_spots else MODEL_SD_DPT
         return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled, rim_sd, model_sd_dpt)
 
     def _score_of_noise(self, fit: Fit) -> Floats:

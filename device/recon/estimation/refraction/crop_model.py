@@ -134,7 +134,7 @@ class CropModel:
     def start(self, eye_dpt: Floats) -> None:
         """Set the weights of the frame's samples, and the object's prior from the likelihood of an eye."""
         edges = self._edges
-        share = MODEL_SHARE if edges.likelihood.geometry.lens_focus_dpt is None else SPOT_MODEL_SHARE
+        share = SPOT_MODEL_SHARE if edges.likelihood.geometry.has_spots else MODEL_SHARE
         self._weighting = Weighting.of(edges.frame, edges.noise, edges.dithered_dn, share)
         self._set_prior(eye_dpt)
 

@@ -95,7 +95,7 @@ class EdgeLikelihood:
         diameter_deg, width_deg = calibration.soft_edge_deg or (calibration.field_deg, None)
         wide = replace(calibration, field_deg=2 * EdgePrior(diameter_deg, width_deg, 1.0).largest_samples)
         otf = InterpolatedOtf(calibration.psfs[index])
-        sample_um = SAMPLE_UM if geometry.lens_focus_dpt is None else SPOT_SAMPLE_UM
+        sample_um = SPOT_SAMPLE_UM if geometry.has_spots else SAMPLE_UM
         self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, otf, sample_um)
         self.grid = self.likelihood.grid
         self.band: Band = self.likelihood.bands.whole
