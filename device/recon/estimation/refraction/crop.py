@@ -9,8 +9,8 @@ frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
 
 b is the mean of the score D' K^-1 r over frames that are drawn from the fit itself: the noise, and the smooth part that
 is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7). It is computed, at
-the cost of four more solves, where the window is smaller than the blurred field (areas); elsewhere it is small, and
-b = 0. The field edge is held.
+the cost of four more solves, behind a diffuser and where the window is smaller than the blurred field (areas);
+elsewhere it is small, and b = 0. The field edge is held.
 """
 
 from collections.abc import Sequence
@@ -93,18 +93,20 @@ class CropRefinement:
         model = self._model
         detail = None
         model.start(eye_dpt)
-        is_cropped = model.seen_share < 1
+        has_spots = self._edges.likelihood.geometry.has_spots
+        model_sd_dpt = SPOT_MODEL_SD_DPT if has_spots else MODEL_SD_DPT
+        has_bias = model.seen_share < 1 and not has_spots
         without_noise = np.zeros(3)
         by_noise = np.zeros(3)
         for done in range(MAX_STEPS):
             model.focus(eye_dpt)
             fit = model.fit(light, detail)
             detail = fit.detail
-            if is_cropped and done < BIAS_STEPS:
+            if has_bias and done < BIAS_STEPS:
                 without_noise = model.fit(fit.expected, detail).score
             if done == 0:
                 covariance = model.covariance(fit.derivatives)
-            if is_cropped and done == 0:
+            if has_bias and done == 0:
                 by_noise = self._score_of_noise(fit)
                 # Of J0 and J45 it is small by symmetry (0.3 sd on four frames), and draws would mostly scatter.
                 by_noise[1:] = 0
@@ -113,12 +115,12 @@ class CropRefinement:
             if done >= FULL_STEPS:
                 step = step / 2
             eye_dpt = eye_dpt + np.clip(step, -LARGEST_STEP_DPT, LARGEST_STEP_DPT)
-            has_settled = bool((np.abs(step) < SETTLED_SDS * np.sqrt(np.diag(covariance))).all())
+            sds_dpt = np.sqrt(np.diag(covariance) + model_sd_dpt**2)
+            has_settled = bool((np.abs(step) < SETTLED_SDS * sds_dpt).all())
             if has_settled:
                 break
         self._edges.fit_smooth(eye_dpt)
         rim_sd = dark_rim(self._edges, eye_dpt, fit, self._psf_radius_px)
-        model_sd_dpt = SPOT_MODEL_SD_DPT if self._edges.likelihood.geometry.has_spots else MODEL_SD_DPT
         return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled, rim_sd, model_sd_dpt)
 
     def _score_of_noise(self, fit: Fit) -> Floats:

@@ -38,7 +38,7 @@ from device.recon.model.preprocessing import Linear
 from device.values import Calibration, Geometry, Image
 
 SAMPLE_UM = 24.0
-SPOT_SAMPLE_UM = 14.0  # behind lenslets, whose spots are in focus: 24 um refuse good frames of a bright head
+SPOT_SAMPLE_UM = 20.0  # behind lenslets, whose spots are in focus: samples of 27 um bias M by 0.02 dpt
 PARAMETERS = 4
 ROUNDING_STEP = 7  # every such row and column shows whether counts are whole numbers
 

@@ -374,8 +374,8 @@ class RefractionEstimator:
         by what such a border cuts.
         """
         edges = self._edges
-        found_dpt, moving_samples = self._alternate(m_dpt, ROUNDS)
-        if moving_samples < MOVING_SAMPLES and not edges.prior.is_at_end(edges.edge):
+        found_dpt, is_found = self._alternate(m_dpt, ROUNDS)
+        if is_found:
             return found_dpt, 0.0
         edges.expect(seen_disc(edges, np.array([m_dpt])) or edges.prior.calibrated)
         edges.fit_smooth(np.array([m_dpt]))
@@ -384,22 +384,26 @@ class RefractionEstimator:
         by_crop_dpt = CROPPED_SD_DPT if seen_share(edges.grid, edges.edge, self._reach_px / edges.grid.n) < 1 else 0.0
         return found_dpt, float(np.hypot(found_dpt - seen_dpt, by_crop_dpt))
 
-    def _alternate(self, m_dpt: float, most: int) -> tuple[float, float]:
+    def _alternate(self, m_dpt: float, most: int) -> tuple[float, bool]:
         """Return M after at most `most` rounds of smooth part, search over M, and edge, from an M on.
 
-        The second value is the last change of the edge in samples.
+        The second value is True if the edge was found. A soft edge has no structure that looks like another refraction:
+        it is found once M does not follow it.
         """
-        step_dpt = self.step_dpt / 2
+        edges, step_dpt = self._edges, self.step_dpt / 2
+        is_soft = edges.prior.softness > 1
         for done in range(1, most + 1):
-            self._edges.fit_smooth(np.array([m_dpt]))
+            edges.fit_smooth(np.array([m_dpt]))
             before_dpt = m_dpt
             m_dpt = self._descend(m_dpt, step_dpt)
-            change_samples = self._edges.move_edge(self._edges(np.array([m_dpt])).step)
+            change_samples = edges.move_edge(edges(np.array([m_dpt])).step)
             step_dpt = self.step_dpt / 4
-            is_settled = change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT
+            stays = abs(m_dpt - before_dpt) < SETTLED_DPT
+            is_settled = stays and (is_soft or change_samples < SETTLED_SAMPLES)
             if is_settled or (done >= ROUNDS and change_samples < MOVING_SAMPLES):
                 break
-        return m_dpt, change_samples
+        is_near = change_samples < MOVING_SAMPLES and not edges.prior.is_at_end(edges.edge)
+        return m_dpt, is_near or (is_soft and stays)
 
     def _descend(self, m_dpt: float, step_dpt: float) -> float:
         """Return the M of the next minimum of the likelihood, with the linear model of the edge around `m_dpt`."""
