@@ -31,8 +31,15 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS, thum
 
 
 def draw_heads(found: Sequence[Frontier]) -> str:
-    """Return the SVG of the frontiers of several heads: accuracy against time, one panel each."""
-    return stacked_svg([_time_plot(head, METHODS, drawn_points(head), {}) for head in found])
+    """Return the SVG of the frontiers of several heads: accuracy against time, one panel each, on one scale."""
+    plots = [_time_plot(head, METHODS, drawn_points(head), {}) for head in found]
+    marks = (mark for plot in plots for curve in plot.series for trail in curve.trails for mark in trail)
+    y = value_axis([mark.y for mark in marks], plots[0].y.title)
+    alike = (
+        replace(plot, title=head.scene, y=y, right=_correlations(y.low, y.high, head.region.truth_variance))
+        for plot, head in zip(plots, found, strict=True)
+    )
+    return stacked_svg([*alike])
 
 
 def ringed(found: Frontier) -> tuple[PressPoint, ...] | tuple[Choice]:

@@ -201,6 +201,10 @@ def test_a_spot_counts_as_visible_with_its_contrast_and_over_the_error():
 def test_heads_have_a_panel_each() -> None:
     names = ("behind the diffuser", "behind lenslets", "behind one lens")
     drawn = draw_heads([replace(measured(np.random.default_rng(seed)), scene=name) for seed, name in enumerate(names)])
-    titles = [text.text or "" for text in ElementTree.fromstring(drawn).iter(f"{SVG}text")]
-    assert [sum(name in title for title in titles) for name in names] == [1, 1, 1]
+    texts = [*ElementTree.fromstring(drawn).iter(f"{SVG}text")]
+    assert [sum(text.text == name for text in texts) for name in names] == [1, 1, 1]
+    levels = [text for text in texts if (text.get("x"), text.get("text-anchor")) == ("66.0", "end")]
+    assert len(levels) > 6
+    scale = [(level.get("y"), level.text) for level in levels]
+    assert scale == scale[: len(scale) // 3] * 3
     assert len(drawn) < LARGEST_BYTES

@@ -45,6 +45,19 @@ def points(step_px: int, dark_dn: float) -> Any:
     return np.random.default_rng(6).normal(dark_dn + spots, 1.0)
 
 
+def spots() -> Any:
+    """Return the counts of the spots of 30 lenses, a third of them in focus within little more than a pixel."""
+    rng, shape = np.random.default_rng(7), SHAPE
+    rows, cols = rng.uniform(10, shape[0] - 10, 30), rng.uniform(10, shape[1] - 10, 30)
+    down, right = np.indices(shape)
+    wide_px = np.where(np.arange(30) < 10, 0.55, 1.5)
+    parts = (
+        np.exp(-((down - row) ** 2 + (right - col) ** 2) / (2 * wide**2)) / wide**2
+        for row, col, wide in zip(rows.round(), cols.round(), wide_px, strict=True)
+    )
+    return rng.normal(64 + 1000 * np.sum(list(parts), axis=0), 1.0)
+
+
 def fine_grain() -> Any:
     """Return the counts of a PSF of grains of one to two pixels in the dark, most of them beside no other."""
     rng = np.random.default_rng(5)
@@ -58,6 +71,7 @@ SHARP: dict[str, Callable[[], Any]] = {
     "one pixel": lambda: points(60, 0) * (np.indices(SHAPE) < 60).all(axis=0),
     "points": lambda: points(16, 64),
     "points of two pixels": lambda: gaussian_filter(points(16, 64), 0.8),
+    "spots": spots,
     "fine grain": fine_grain,
     "one pixel of half the light": lambda: (
         gaussian_filter(points(60, 64), 20) + 4e6 * (np.indices(SHAPE) == 48).all(axis=0)

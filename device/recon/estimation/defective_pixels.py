@@ -61,6 +61,7 @@ PSF_NOISE_SD = 1.0  # subtracted from the PSF's ring excess; the measured noise 
 HOT_RANGES = (10.0, 30.0)
 HOT_SHARE = 0.05  # of the PSF's brightest light (its quantile RANGE_SHARE): a dimmer excess does no harm
 CORE_SHARE = 0.02  # of the light: a pixel with more is the focus of a sharp PSF, and not hot
+SPREAD_SHARE = 0.05  # of a pixel's light, in its second darkest neighbour: spots of lenses 0.10 to 0.21, hot pixels 0
 MAX_HOT_LIGHT = 0.5  # share of the light: candidates with more are the points of a sharp PSF
 LOW_SHARE = 0.5  # of the black level: the lowest value of a working pixel is so far below it, plus the noise limit
 BLACK_PER_LIMIT = 4  # least black level over the noise limit; with a lower one, values below black are not tested
@@ -436,6 +437,20 @@ def without_hot_pixels(psf: Psf) -> Psf:
     return psf if pixels is psf.pixels else replace(psf, pixels=pixels)
 
 
+def _spread(pixels: Image, places: Places) -> NDArray[np.float32]:
+    """Return the light of the second darkest of a place's four neighbours over its own, both above the pixels beyond.
+
+    The image of a point is wider than a pixel to all sides; hot pixels, even two of them side by side, are not.
+    """
+    around = np.pad(pixels, 2, mode="edge")
+    rows, cols = (index + 2 for index in np.unravel_index(places, pixels.shape))
+    near, far = (
+        np.sort([around[rows - k, cols], around[rows + k, cols], around[rows, cols - k], around[rows, cols + k]], 0)[1]
+        for k in (1, 2)
+    )
+    return np.asarray((near - far) / np.maximum(around[rows, cols] - far, np.finfo(np.float32).tiny))
+
+
 def _hot_pixels(pixels: Image) -> Places:
     """Return the flat indices of the hot pixels in the image of a PSF (rows, cols), of sum 1.
 
@@ -459,6 +474,7 @@ def _hot_pixels(pixels: Image) -> Places:
     limit = NOISE_SD**2
     kernels.outliers(pixels, zero_row, known, places, limit * noise.per_dn, limit * noise.floor_dn2, HOT_RANGES, is_hot)
     found = places[is_hot]
+    found = found[_spread(pixels, found) < SPREAD_SHARE]
     are_points = float(pixels.ravel()[found].sum(dtype=np.float64)) > MAX_HOT_LIGHT
     bright = np.count_nonzero(pixels > least)
     return none if are_points or found.size > MAX_OUTLIERS * bright else found
