@@ -267,7 +267,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
             refraction_offset=_offset(manifest.get("refraction_offset")),
             white=_white(manifest.get("white")),
             source_in_focus=_BOOL.validate_python(manifest.get("source_in_focus", False)),
-            soft_edge_deg=_EDGE.validate_python(manifest.get("soft_edge_deg")),
+            soft_edge_deg=_soft_edge(manifest.get("soft_edge_deg")),
             **{name: _checked_map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
         figures = tuple(manifest["figures"].items())
@@ -281,7 +281,6 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
 
 
 _BOOL = TypeAdapter(bool)
-_EDGE: TypeAdapter[tuple[float, float] | None] = TypeAdapter(tuple[float, float] | None)
 _NUMBERS = TypeAdapter(dict[str, float | None])
 _PROVENANCE = TypeAdapter(Provenance)
 _COLOUR: TypeAdapter[Colour] = TypeAdapter(Colour)
@@ -313,6 +312,16 @@ def _white(table: dict[str, Any] | None) -> WhiteReference | None:
     if not all(isfinite(value) and value > 0 for value in lights.values()):
         raise ValueError("the white reference holds a value that is no light")
     return WhiteReference(tuple(lights.items()))
+
+
+def _soft_edge(pair: Any) -> tuple[float, float] | None:
+    """Return the soft edge of a manifest; None without one. ValueError unless both angles are finite and above 0."""
+    if pair is None:
+        return None
+    diameter_deg, width_deg = _numbers(dict(zip(("diameter_deg", "width_deg"), pair, strict=True))).values()
+    if not (isfinite(diameter_deg) and isfinite(width_deg) and min(diameter_deg, width_deg) > 0):
+        raise ValueError("the soft edge of the field holds a value that is no angle")
+    return diameter_deg, width_deg
 
 
 def _checked_map(array: np.ndarray | None, name: str) -> np.ndarray | None:

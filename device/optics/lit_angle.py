@@ -4,22 +4,18 @@ It is wider than the cone of its cap where the dies of its LEDs are no points. O
 width of its dies; the matrix's are small, and its field keeps a sharp edge.
 """
 
-from collections.abc import Callable
 from functools import cache
 from math import acos, pi
 
-import numpy as np
-from numpy.typing import NDArray
-
 from device.config.head_file import InstrumentSpec
 from device.config.shipped_heads import LIGHT_PATH
-from device.optics.led_cap import LedCap, field_to_share_deg, half_maximum_deg, relative_irradiance
+from device.optics.led_cap import LedCap, field_to_share_deg, half_maximum_deg
 from device.optics.light_path import LightPath, led_cap, load_light_path
 from device.optics.matrix import lamps_of
 from device.values import Colour
 
-Floats = NDArray[np.float64]
-EDGE_SHARE = 0.1  # of the axis's irradiance, at the edge of a picture's field: little light comes from beyond
+EDGE_SHARE = 0.03  # of the axis's irradiance, at the edge of a picture's field: 0.5 % of the light is beyond
+RAMP_SHARE = 0.1  # of it, through which the cosine ramp passes
 
 
 def cap_of(spec: InstrumentSpec, colour: Colour | None = None) -> LedCap | None:
@@ -41,28 +37,15 @@ def picture_field_deg(spec: InstrumentSpec) -> float | None:
 def soft_edge_deg(spec: InstrumentSpec) -> tuple[float, float] | None:
     """Return diameter and full width in degrees of the cosine ramp by which the light of a head fades; None: sharp.
 
-    It has half of the axis's irradiance at that diameter, and EDGE_SHARE at the edge of the picture's field.
+    It passes through half of the axis's irradiance, at that diameter, and through RAMP_SHARE of it.
     """
     cap = cap_of(spec)
     if spec.optics is None or cap is None:
         return None
     magnification = spec.optics.angular_magnification
     half_deg = half_maximum_deg(cap, magnification)
-    outward_deg = (field_to_share_deg(cap, magnification, EDGE_SHARE) - half_deg) / 2
-    return half_deg, outward_deg / (0.5 - acos(1 - 2 * EDGE_SHARE) / pi)
-
-
-def lamp_profile(spec: InstrumentSpec) -> Callable[[Floats], Floats] | None:
-    """Return the irradiance of a flat retina over that on the axis, by the angle off the axis in degrees.
-
-    None for a head whose lamp lights its field evenly.
-    """
-    cap = cap_of(spec)
-    if spec.optics is None or cap is None:
-        return None
-    known_deg = np.arange(0.0, 60.0, 0.1)
-    share = relative_irradiance(cap, spec.optics.angular_magnification, known_deg)
-    return lambda away_deg: np.asarray(np.interp(away_deg, known_deg, share))
+    outward_deg = (field_to_share_deg(cap, magnification, RAMP_SHARE) - half_deg) / 2
+    return half_deg, outward_deg / (0.5 - acos(1 - 2 * RAMP_SHARE) / pi)
 
 
 def has_sharp_edge(spec: InstrumentSpec) -> bool:

@@ -4,7 +4,6 @@ import numpy as np
 
 from device.config.head_file import InstrumentSpec
 from device.errors import FrameError
-from device.optics.lit_angle import lamp_profile
 from device.recon.assessment.aiming import Aim, AimingGuide
 from device.recon.assessment.frame_quality import FrameQualityGate, assess, assess_picture
 from device.recon.assessment.laterality import Laterality, laterality
@@ -29,7 +28,7 @@ class FrameAssessor:
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, spec: InstrumentSpec
     ) -> None:
         camera = spec.camera
-        self._frame_assessor = FrameQualityGate(calibration, shape, planner, index, lamp_profile(spec))
+        self._frame_assessor = FrameQualityGate(calibration, shape, planner, index)
         self._aimer = AimingGuide(camera.exposure_s, self._frame_assessor.deg_per_sample)
         self._geometry = calibration.geometry
         self._field_deg = calibration.field_deg
@@ -64,9 +63,7 @@ class FrameAssessor:
         """
         if report.method == NO_METHOD and first.code is None:
             first = FAILED_VERDICT
-        coverage = report.quality.get("coverage")
-        lit = None if coverage is None else coverage / self._frame_assessor.lit_share
-        return assess_picture(first, report.residual, lit, target.tries, target.retakes)
+        return assess_picture(first, report.residual, report.quality.get("coverage"), target.tries, target.retakes)
 
     def estimate_laterality(self, picture: Image, verdict: Verdict, target: CaptureTarget) -> Laterality | None:
         """Return the laterality estimate; `picture` is cropped to the illuminated field.

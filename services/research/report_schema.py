@@ -79,7 +79,7 @@ QUALITY: Mapping[str, str] = {
     "missing": "Share of the frame that was left out (saturated, defective, not a number), 0 to 1.",
     "mean_dn": "Mean of the pixels that are not missing, above dark, in DN.",
     "through": "Share of the light that came through the eye: one minus stray light over mean. Eyes have 0.9 and more.",
-    "coverage": "Share of the field that is lit, 0 to 1; null if the field is not known.",
+    "coverage": "Share of the field in the light of the lamp that is lit, 0 to 1; null if the field is not known.",
     "cutoff_per_px": "Lowest frequency where the signal is below the noise, in cycles per sensor pixel.",
     "resolution_um": "Finest detail: half a period of `cutoff_per_px` on the retina in um; null without geometry.",
     "structure_nats": (

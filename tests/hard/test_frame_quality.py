@@ -14,7 +14,6 @@ import pytest
 
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
-from device.optics.lit_angle import lamp_profile
 from device.recon.assessment.aiming import AimingGuide, moved_samples
 from device.recon.assessment.frame_quality import FrameFigures, FrameQualityGate, assess, assess_picture
 from device.sim import calibration_targets
@@ -158,7 +157,7 @@ def test_soft_edge_of_the_high_power_ring_is_told_from_a_small_pupil(name: str) 
     spec = with_keys(scene(name), peak_e=38_000.0)
     shape = spec.camera.rows, spec.camera.cols
     calibration = simulated_calibration(World(spec, VirtualClock()))
-    gate = FrameQualityGate(calibration, shape, scenes.PLANNER, lamp=lamp_profile(spec))
+    gate = FrameQualityGate(calibration, shape, scenes.PLANNER)
     codes = []
     for pupil_um in (7700.0, 1500.0):
         world = World(with_keys(spec, **eye(pupil_um=pupil_um)), VirtualClock())

@@ -132,3 +132,12 @@ def test_a_refraction_offset_that_is_no_number_is_refused(archive, value):
     files["manifest.toml"] = sealed(text.replace("m_dpt = 0.25", f"m_dpt = {value}"))
     with pytest.raises(CalibrationDamaged):
         archive.add_files(files)
+
+
+@pytest.mark.parametrize(
+    "edge", [(np.nan, 21.8), (30.2, np.inf), (30.2, -1.0), (0.0, 21.8), (True, 21.8), ("30.2", 21.8), (30.2,)]
+)
+def test_a_soft_edge_that_is_no_angle_is_refused(archive, edge):
+    with pytest.raises(CalibrationDamaged) as caught:
+        archive.add(replace(calibration(), soft_edge_deg=edge), WHO)
+    assert "import it again" in caught.value.remedy

@@ -10,7 +10,7 @@ from device.config.head_file import load_head
 from device.light_safety.hazard import light_limits
 from device.optics.led_cap import LedCap, centre_over_mean, dark_deg, half_maximum_deg, relative_irradiance, seen_share
 from device.optics.light_path import load_light_path
-from device.optics.lit_angle import soft_edge_deg
+from device.optics.lit_angle import picture_field_deg, soft_edge_deg
 from hardware.parts.dimensions import Fits, dimensions
 from services.workshop.light_report import expected_beam, limit_shares
 from services.workshop.light_tolerances import tolerances
@@ -55,6 +55,15 @@ def test_a_cosine_ramp_describes_the_soft_edge_of_the_high_power_ring() -> None:
     place = np.clip((diameter_deg / 2 - off_deg) / width_deg + 0.5, 0, 1)
     assert 0.5 - 0.5 * np.cos(pi * place) == pytest.approx(relative_irradiance(CAP, RELAY, off_deg), abs=0.06)
     assert soft_edge_deg(load_head(HARDWARE / "heads" / "imx296.toml")) is None
+
+
+def test_little_light_comes_from_beyond_the_picture_of_the_high_power_ring() -> None:
+    """Behind lenslets 2.6 % of the light looked like a second image."""
+    field_deg = picture_field_deg(load_head(HARDWARE / "heads" / "imx296_power.toml"))
+    assert field_deg is not None
+    off_deg = np.arange(0.0, 27.0, 0.05)
+    light = off_deg * relative_irradiance(CAP, RELAY, off_deg)
+    assert light[off_deg > field_deg / 2].sum() < 0.006 * light.sum()
 
 
 def test_penumbra_of_the_high_power_ring_is_that_of_an_independent_trace() -> None:

@@ -6,7 +6,7 @@ detail along one direction. Causes that one frame cannot show are not reported: 
 leaves no directional detail, and a closed lid gives the same frame as a wall.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from math import hypot, isfinite
 from typing import Any, Literal
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from device.errors import FrameError
 from device.recon.assessment.quality_figures import MAX_SATURATED, MIN_THROUGH
 from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.estimation.refraction.field import lamp_light
 from device.recon.frames import plane
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
@@ -27,7 +28,6 @@ from device.recon.solvers.tv import EvidenceWiener
 from device.values import Calibration, Image, Verdict
 
 Floats = NDArray[np.float64]
-Lamp = Callable[[Floats], Floats]  # irradiance over that of the axis, by the angle off the axis in degrees
 Code = Literal[
     "shot.saturated",
     "shot.dark",
@@ -51,7 +51,6 @@ ONE_SIDED = 0.1
 MAX_SMEAR = 0.22
 MAX_MEASURABLE_SATURATION = 0.25  # share of saturated pixels above which no other figure is valid
 FIELD_SAMPLES = 64  # across the field, at the least
-LIT_SHARE = 0.3  # of the axis's irradiance: an even retina has half of the field's median there
 SMEAR_CYCLES = (12, 40)  # across the field: higher is noise, lower is the illumination
 
 
@@ -60,10 +59,10 @@ class FrameFigures:
     """Figures of one raw frame; None if a figure is unknown (no field, no gain, or too much light).
 
     `saturated` is the share of saturated pixels; `light_e_per_um2` the mean light on the sensor in electrons per um^2,
-    `through` the share of it that came through the field; `coverage` is the lit share of the field; `off_x` and `off_y`
-    are the position of its centre of light in field radii, right and down; `smear` is the directional dependence of the
-    detail, 0 to 1; `wide` is the rms radius of the light on the sensor over that of an even retina. `coverage` is over
-    the share that the lamp lights, and above 1 where light is seen beyond it.
+    `through` the share of it that came through the field; `coverage` is the lit share of the field in the light of the
+    lamp; `off_x` and `off_y` are the position of its centre of light in field radii, right and down; `smear` is the
+    directional dependence of the detail, 0 to 1; `wide` is the rms radius of the light on the sensor over that of an
+    even retina.
     """
 
     saturated: float
@@ -149,8 +148,6 @@ class FrameQualityGate:
         Planner of the FFTs.
     index
         Index of the PSF in the calibration.
-    lamp
-        Light of the lamp, where it gives the field a soft edge; None: it lights the field evenly.
     """
 
     def __init__(
@@ -159,7 +156,6 @@ class FrameQualityGate:
         shape: tuple[int, int],
         planner: Planner,
         index: int = 0,
-        lamp: Lamp | None = None,
     ) -> None:
         self._sensor = calibration.sensor
         self._geometry = calibration.geometry
@@ -167,7 +163,7 @@ class FrameQualityGate:
         self._field: _CoarseField | None = None
         if isfinite(radius_px):
             n = max(1, int(2 * radius_px // FIELD_SAMPLES))
-            self._field = _CoarseField(calibration, tight_model(calibration, shape, n, planner, index), lamp)
+            self._field = _CoarseField(calibration, tight_model(calibration, shape, n, planner, index))
         self._defects = DefectFinder(calibration, shape, index)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> FrameFigures:
@@ -210,11 +206,6 @@ class FrameQualityGate:
         return None if self._field is None else self._field.shown
 
     @property
-    def lit_share(self) -> float:
-        """Share of the field that the lamp lights: 1 with an even lamp or without a known field."""
-        return 1.0 if self._field is None else self._field.lit_share
-
-    @property
     def deg_per_sample(self) -> float | None:
         """Width of one sample of `picture` in degrees; None if unknown."""
         return None if self._field is None or self._geometry is None else self._field.bin / self._geometry.px_per_deg
@@ -228,13 +219,12 @@ class FrameQualityGate:
 class _CoarseField:
     """Coarse solution of a frame, and the figures of its field."""
 
-    def __init__(self, calibration: Calibration, model: Model, lamp: Lamp | None) -> None:
+    def __init__(self, calibration: Calibration, model: Model) -> None:
         self._span_dn = calibration.sensor.white_dn - calibration.sensor.black_dn
         self._solver = EvidenceWiener(model, calibration)
         self._prepare = Preprocessor(calibration, model.grid)
-        light = _lamp_light(calibration, model, lamp)
+        light = model.mask * lamp_light(calibration, model.grid)
         self._even_radius = _rms_radius(model.blur(light)[model.grid.slices])
-        self.lit_share = float((light[model.mask > 0.5] >= LIT_SHARE).mean())
         self._picture: Image = np.zeros(model.grid.shape, np.float32)
         self._shown = model.grid.shown
         self.bin = model.grid.n
@@ -267,7 +257,6 @@ class _CoarseField:
         frame = self._prepare(counts, dark, defects)
         solver.start(frame)
         solver.finish(picture)
-        covered = solver.diagnostics.quality["coverage"]
         shown = self.shown
         light = float(shown[self._inner].sum(dtype=np.float64))
         off_x, off_y = (
@@ -277,7 +266,7 @@ class _CoarseField:
         return replace(
             brightness,
             through=solver.diagnostics.quality["through"],
-            coverage=None if covered is None else covered / self.lit_share,
+            coverage=solver.diagnostics.quality["coverage"],
             off_x=off_x,
             off_y=off_y,
             smear=self._smear(shown),
@@ -292,15 +281,6 @@ class _CoarseField:
             return None
         power = np.abs(np.fft.rfft2((shown / mean - 1) * window))[self._band] ** 2 * self._weight
         return float(np.abs((power * self._turn).sum()) / power.sum())
-
-
-def _lamp_light(calibration: Calibration, model: Model, lamp: Lamp | None) -> Image:
-    """Return an even retina in the light of the lamp, 1 on the axis, float32 of the shape of the grid."""
-    if lamp is None or calibration.geometry is None:
-        return model.mask
-    rows, cols = (np.arange(size) - middle for size, middle in zip(model.grid.shape, model.grid.centre, strict=True))
-    away_deg = np.hypot(rows[:, None], cols) * model.grid.n / calibration.geometry.px_per_deg
-    return np.asarray(model.mask * lamp(away_deg), np.float32)
 
 
 def brightest(counts: Pixels, dark: Pixels | None) -> tuple[Pixels, Pixels | None]:

@@ -21,6 +21,7 @@ from device.recon.estimation.ghost import find_ghost, ghost_trace
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.estimation.power_law_prior import Fit, PowerLaw, PowerLawPrior
+from device.recon.estimation.refraction.field import lamp_light
 from device.recon.estimation.shading import Shading
 from device.recon.estimation.spots import find_spots
 from device.recon.estimation.uneven_light import MIN_UNEVENNESS, find_uneven_light, unevenness
@@ -36,6 +37,7 @@ KAPPA = 1.8  # of tau: within 0.03 dB of the optimum over 1 to 120 ke-, bins 2 a
 RHO = 5.0  # stiffness of z and w, in units of tau per level
 STIFF = 1.0  # stiffness of v, in units of a typical weight
 TAPER_PX = 60
+LAMP_SHARE = 0.3  # of the axis's irradiance: where the lamp gives less, the field counts as unlit by it
 FILLS = 2  # of a frame with gaps; see `_fill_gaps`
 
 
@@ -61,13 +63,13 @@ class EvidenceWiener:
 
     def __init__(self, model: Model, calibration: Calibration) -> None:
         self.model = model
-        self.sensor = calibration.sensor
-        self.geometry = calibration.geometry
+        self.calibration = calibration
         self.shading = Shading(model)
         self.background = Background(self.shading, model.grid.n)
         self.prior = PowerLawPrior(model)
         self.sample = FrequencySample.of(model)
         self.fade = taper(model.grid.window, min(0.5, TAPER_PX / model.grid.n / min(model.grid.window)))
+        self.lit = model.mask * (lamp_light(calibration, model.grid) > LAMP_SHARE)
         self.x: Image = np.zeros(model.grid.shape, np.float32)
         self.blurred: Image = np.zeros(model.grid.shape, np.float32)
         self.diagnostics = Diagnostics()
@@ -148,7 +150,7 @@ class EvidenceWiener:
         spectrum = fft.forward()
         energy = float(np.vdot(weight, weight))
         measured = self.sample.noise_variance(self.sample.energies(spectrum), grid.size) * grid.size
-        noise = Noise.of(self.sensor, grid.n, measured / energy, frame.mean_dn)
+        noise = Noise.of(self.calibration.sensor, grid.n, measured / energy, frame.mean_dn)
         lit = float(np.einsum("ij,ij,ij->", frame.y, weight, weight))
         noise_dn2 = max(noise.per_dn * lit + noise.floor_dn2 * energy, 1e-20)
         fit = self.prior.fit(spectrum, noise_dn2)
@@ -182,7 +184,7 @@ class EvidenceWiener:
 
     def _quality(self, fit: Fit, mean_dn: float) -> dict[str, float | None]:
         noise_dn2 = self.detail.noise_dn2
-        limit = quality_figures.cutoff(self.prior, fit.law, noise_dn2, self.model.grid.n, self.geometry)
+        limit = quality_figures.cutoff(self.prior, fit.law, noise_dn2, self.model.grid.n, self.calibration.geometry)
         nats, sure = quality_figures.structure(self.prior, fit.seen, fit.levels, noise_dn2)
         return {
             "structure_nats": nats,
@@ -213,7 +215,7 @@ class EvidenceWiener:
         out *= self.model.mask
         noise_dn = float(self.detail.noise.variance_dn2(self.level) ** 0.5)
         if isfinite(self.model.grid.radius_samples):  # without a known field the lit share is undefined
-            coverage = quality_figures.coverage(out, self.model.mask, noise_dn)
+            coverage = quality_figures.coverage(out, self.lit, noise_dn)
             self._add_diagnostics(Diagnostics(quality={"coverage": coverage}))
 
 

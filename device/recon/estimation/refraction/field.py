@@ -16,7 +16,7 @@ from device.recon.estimation.shading import BLOCK, RIDGE, STRAY_RIDGE, block_mea
 from device.recon.model.fft_plans import Spectrum
 from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import Linear
-from device.values import Image
+from device.values import Calibration, Image
 
 MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radius and of half the width
 FIRST_WIDTH_DEG = 0.4  # of the first model: a step has no derivative with respect to its width
@@ -131,6 +131,18 @@ class EdgePrior:
         """Return an edge in degrees, with the standard deviation of its diameter."""
         radius, down, right, width = (edge.vector / self._per_deg).tolist()
         return FieldEdge(2 * radius, down, right, width, 2 * radius_sd_samples / self._per_deg)
+
+
+def lamp_light(calibration: Calibration, grid: Grid) -> Image:
+    """Return an even retina in the light of the lamp, 1 on the axis and to the end of a sharp field, float32 (grid)."""
+    if calibration.soft_edge_deg is None or calibration.geometry is None:
+        return np.ones(grid.shape, np.float32)
+    edge = EdgePrior(*calibration.soft_edge_deg, calibration.geometry.px_per_deg / grid.n).calibrated
+    rows, cols = (
+        np.arange(size, dtype=np.float32) - np.float32(middle)
+        for size, middle in zip(grid.shape, grid.centre, strict=True)
+    )
+    return edge.light(rows[:, None], cols[None])
 
 
 @dataclass(frozen=True)
