@@ -9,7 +9,7 @@ import { qrCode } from "./qr_code.js";
 import { navigate } from "./router.js";
 import { dismissAlert, lowerAlert, lowerAlerts, raiseAlert } from "./alerts.js";
 import { previewActions } from "./aiming.js";
-import { lock } from "./login.js";
+import { changeSecret, lock } from "./login.js";
 import { aimByItself } from "./going_on.js";
 import { refreshStatus, setControl } from "./status.js";
 import * as visits from "./visit.js";
@@ -28,6 +28,7 @@ const goToAim = (slot) => navigate({ screen: "aim", visit: currentRoute().visit,
 const navigationActions = {
   go: navigate,
   lock,
+  changeSecret,
   begin: (number) => visits.begin(number),
   resume: visits.resume,
   retryUploads: visits.retryUploads,
