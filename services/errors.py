@@ -16,6 +16,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── CrossOriginRequest            cross-origin request (CSRF check)
 │   ├── UntrustedHost                 Host header is not a name of the instrument
 │   ├── ServerFull                    too many clients at once
+│   ├── TooManyRequests               more often than the rate of an operation
 │   ├── IdempotencyKeyConflict        idempotency key of another request
 │   ├── VisitFinished                 the visit is finished
 │   ├── ConsentMissing                no consent recorded for the visit
@@ -163,6 +164,13 @@ class ServerFull(RequestRefused):
 
     code = "link.full"
     default_remedy = "Too many screens are connected. Close the page on the others, then wait a little."
+
+
+class TooManyRequests(RequestRefused):
+    """One client sends an operation more often than permitted; `wait_s` is the time until the next one."""
+
+    code = "link.often"
+    default_remedy = "Wait until the time is over, then try again. If you did nothing so often, call the technician."
 
 
 class VisitFinished(RequestRefused):

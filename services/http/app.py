@@ -1,6 +1,6 @@
 """App factory: every endpoint, middleware and background worker of one head arbiter."""
 
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -20,6 +20,7 @@ from services.http.control_lease import ControlLease
 from services.http.dependencies import acquire_control_lease, acquire_lease_for_light
 from services.http.openapi import DocumentedApp
 from services.http.problem_responses import problem_response, register_error_handlers
+from services.http.rate_limits import RATES, Rate, RateLimits
 from services.http.routes.audit import audit_router
 from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
@@ -74,6 +75,7 @@ def create_app(
     stream_limits: ClientLimits = STREAM_LIMITS,
     preview_limits: ClientLimits = PREVIEW_LIMITS,
     audit_log: AuditLog | None = None,
+    rates: Mapping[str, Rate] = RATES,
 ) -> Application:
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
@@ -81,7 +83,7 @@ def create_app(
     name of this computer. `programme` None loads the default programme. `technician_routers` are those of the
     technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
-    `audit_log`: None keeps none.
+    `audit_log`: None keeps none. `rates`: limits of operations in time.
     """
     store = arbiter.context.store
     clock = arbiter.context.clock
@@ -94,7 +96,9 @@ def create_app(
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.owner.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
-    app = _http_application(life, authenticator, own_host_names() if host_names is None else host_names)
+    app = _http_application(
+        life, authenticator, own_host_names() if host_names is None else host_names, RateLimits(rates, clock)
+    )
     app.add_middleware(AuditTrail, audit_log=audit_log, clock=clock)
     pending = PendingCaptures()
     controlled = [Depends(acquire_control_lease(lease))]
@@ -130,7 +134,9 @@ def _alert_monitor(
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 
 
-def _http_application(lifespan: Lifespan, authenticator: Authenticator, host_names: tuple[str, ...]) -> FastAPI:
+def _http_application(
+    lifespan: Lifespan, authenticator: Authenticator, host_names: tuple[str, ...], rates: RateLimits
+) -> FastAPI:
     """Return a FastAPI application with access control, problem responses and middlewares, the last one outermost."""
     app = DocumentedApp(
         title="Diffuscope",
@@ -139,7 +145,7 @@ def _http_application(lifespan: Lifespan, authenticator: Authenticator, host_nam
         openapi_url="/api/openapi.json",
         docs_url=None,
         redoc_url=None,
-        dependencies=[Depends(access_required(authenticator))],
+        dependencies=[Depends(access_required(authenticator, rates))],
         responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
     )
     register_error_handlers(app)

@@ -14,6 +14,7 @@ from services.errors import AuthenticationError
 from services.http.access import ACCESS, Access
 from services.http.app import create_app
 from services.http.authentication import OWN_SCREEN, Authenticator, Peer
+from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
 from services.identity.users import ROLES, Role
@@ -279,6 +280,27 @@ def test_a_remote_client_cannot_keep_the_device_locked(fresh: Rig) -> None:
     fresh.clock.sleep(60)
     here = ask(fresh.app, "POST", "/api/login", client=HERE, json={"name": "Asha", "secret": PIN})
     assert here.status_code == 200
+
+
+@pytest.mark.parametrize("operation", RATES)
+def test_operations_are_limited_in_rate(operation: str, fresh: Rig) -> None:
+    """Beyond the burst a request waits for its interval; another user, or another address, does not wait."""
+    for name in ("Asha", "Ravi"):
+        fresh.authenticator.users.add(name, PIN, ROLES)
+    tokens = [fresh.authenticator.sign_in(name, PIN, OWN_SCREEN) for name in ("Asha", "Ravi")]
+    rate, (verb, path) = RATES[operation], operation.split()
+    app = create_app(fresh.arbiter, fresh.authenticator).http
+
+    def ask_as(token: str, client: tuple[str, int] = AWAY) -> tuple[int, float | None]:
+        answer = ask(app, verb, path, token, client, json={})  # an empty body is refused after the count
+        return answer.status_code, answer.json().get("wait_s")
+
+    assert 429 not in {ask_as(tokens[0])[0] for _ in range(rate.burst)}
+    assert ask_as(tokens[0]) == (429, rate.interval_s)
+    assert ask_as(tokens[1], HERE)[0] != 429
+    fresh.clock.sleep(rate.interval_s)
+    assert ask_as(tokens[0])[0] != 429
+    assert ask_as(tokens[0])[0] == 429
 
 
 def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:
