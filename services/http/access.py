@@ -78,6 +78,7 @@ ACCESS: dict[str, Access] = {
     "GET /api/visits": READ,
     "POST /api/visits": EXAM,
     "GET /api/visits/{id}": READ,
+    "GET /api/visits/{id}/changes": READ,
     "PATCH /api/visits/{id}": EXAM,
     "POST /api/visits/{id}/slots": EXAM,
     "POST /api/visits/{id}/not-possible": EXAM,

@@ -25,6 +25,7 @@ ACTIONS = {
     "DELETE /api/users/{name}": "remove-user",
     "POST /api/visits": "begin-visit",
     "GET /api/visits/{id}": VIEW,
+    "GET /api/visits/{id}/changes": VIEW,
     "PATCH /api/visits/{id}": "answer",
     "POST /api/visits/{id}/slots": "choose-picture",
     "POST /api/visits/{id}/not-possible": "not-possible",

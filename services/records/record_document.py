@@ -68,6 +68,13 @@ def as_object(value: JsonValue) -> JsonObject:
     return value
 
 
+def as_list(value: JsonValue) -> list[JsonValue]:
+    """Return the value unchanged if it is a JSON list; ValueError otherwise."""
+    if not isinstance(value, list):
+        raise ValueError(f"{type(value).__name__} where a list was kept")
+    return value
+
+
 def whole_number(value: object) -> int:
     """Return the value unchanged if it is a whole number of at least 0; ValueError otherwise."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:

@@ -262,6 +262,29 @@ class AnswerRow(Base):
     )
 
 
+class ChangeRow(Base):
+    """One change of a visit, number 1 first: time (UTC), user ("" for the device), form field, `outcome`, `laterality`.
+
+    `was` and `value` (JSON): before and after; `why`: reason of a reopening, or null. Rows are only added.
+    """
+
+    __tablename__ = "changes"
+
+    visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    at: Mapped[str] = mapped_column(Text)
+    user: Mapped[str] = mapped_column(Text)
+    field: Mapped[str] = mapped_column(Text)
+    was: Mapped[str] = mapped_column(Text)
+    value: Mapped[str] = mapped_column(Text)
+    why: Mapped[str | None] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("json_valid(was) AND json_valid(value)", name="change_is_json"),
+        {"sqlite_strict": True},
+    )
+
+
 class CaptureSlotRow(Base):
     """Visit and picture slot of a capture; a test picture has no such row."""
 

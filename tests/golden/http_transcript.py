@@ -147,10 +147,13 @@ def _ends(log: Transcript, at: str, id: str) -> None:
     log.ask(finish, f"/api/visits/{UNKNOWN_VISIT}/finish", json=log.key())
     log.ask("PATCH /api/visits/{id}", at, json=log.key(field="age", value=55), note="the visit is finished")
     log.ask("POST /api/captures", json=log.key(eye="OD", visit=id, slot="R-centre"), note="the visit is finished")
-    log.ask(reopen, f"{at}/reopen", json=log.key())
+    log.ask(reopen, f"{at}/reopen", json=log.key(), note="without a reason")
+    log.ask(reopen, f"{at}/reopen", json=log.key(reason="answer"))
+    log.ask("GET /api/visits/{id}/changes", f"{at}/changes")
+    log.ask("GET /api/visits/{id}/changes", f"/api/visits/{UNKNOWN_VISIT}/changes")
     log.ask(finish, f"{at}/finish", json=log.key())
     log.instrument.clock.elapsed_s += 3 * 86400
-    log.ask(reopen, f"{at}/reopen", json=log.key(), note="three days later")
+    log.ask(reopen, f"{at}/reopen", json=log.key(reason="answer"), note="three days later")
 
 
 def _controllers(log: Transcript) -> None:

@@ -376,6 +376,7 @@ def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
         "/api/programme": {"get"},
         "/api/visits": {"get", "post"},
         "/api/visits/{id}": {"get", "patch"},
+        "/api/visits/{id}/changes": {"get"},
         "/api/visits/{id}/not-possible": {"post"},
         "/api/visits/{id}/slots": {"post"},
         "/api/visits/{id}/finish": {"post"},

@@ -187,14 +187,35 @@ def test_a_finish_can_be_undone_on_the_same_day_of_the_instruments_clock(old_rig
     refused(patch(old_rig, visit, "age", 5), 409, "visit.finished")
     press = {"key": next(keys), "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
     refused(old_rig.request("POST", "/api/captures", json=press), 409, "visit.finished")
-    opened = post(old_rig, f"/api/visits/{visit['id']}/reopen")
+    opened = post(old_rig, f"/api/visits/{visit['id']}/reopen", reason="answer")
     assert opened["finished_at"] is opened["outcome"] is opened["undo_until"] is None
     assert patch(old_rig, visit, "age", 5).status_code == 200
     assert post(old_rig, f"/api/visits/{visit['id']}/finish")["undo_until"]
     old_rig.clock.elapsed_s += 86400
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["undo_until"] is None
-    late = old_rig.request("POST", f"/api/visits/{visit['id']}/reopen", json={"key": next(keys)})
+    late = old_rig.request("POST", f"/api/visits/{visit['id']}/reopen", json={"key": next(keys), "reason": "answer"})
     refused(late, 409, "visit.finished")
+
+
+def test_the_history_of_a_visit_keeps_what_was_who_changed_it_and_why(old_rig: Any) -> None:
+    visit = begin(old_rig)
+    at = f"/api/visits/{visit['id']}"
+    for field, value in (("vision_od", "6/60"), ("vision_od", "6/6"), ("vision_od", "6/6"), ("name", "Meena")):
+        assert patch(old_rig, visit, field, value).status_code == 200
+    post(old_rig, f"{at}/finish")
+    without_reason = old_rig.request("POST", f"{at}/reopen", json={"key": next(keys)})
+    assert without_reason.status_code == 422
+    assert old_rig.request("GET", at).json()["finished_at"] is not None
+    post(old_rig, f"{at}/reopen", reason="answer")
+    changes = old_rig.request("GET", f"{at}/changes").json()["changes"]
+    assert [(one["number"], one["user"], one["field"], one["was"], one["value"], one["why"]) for one in changes] == [
+        (1, "Demo", "vision_od", None, "6/60", None),
+        (2, "Demo", "vision_od", "6/60", "6/6", None),
+        (3, "Demo", "outcome", None, "refer_picture", None),
+        (4, "Demo", "outcome", "refer_picture", None, "answer"),
+    ]
+    assert [one["at"] for one in changes] == sorted(one["at"] for one in changes)
+    assert old_rig.request("GET", "/api/visits/none/changes").status_code == 404
 
 
 def test_a_known_number_is_the_same_patient_with_or_without_the_prefix(old_rig: Any) -> None:
@@ -303,11 +324,11 @@ def test_every_form_field_stores_and_returns_its_answers(old_rig: Any) -> None:
     left = dict.fromkeys(answers.keys() - {"name", "phone", "village"})  # identifying fields are removed completely
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"] == left
     assert post(old_rig, f"/api/visits/{visit['id']}/finish")["outcome"]["code"] == "refer_picture"
-    post(old_rig, f"/api/visits/{visit['id']}/reopen")
+    post(old_rig, f"/api/visits/{visit['id']}/reopen", reason="answer")
     for urgent in ("sudden_loss", "pain"):
         patch(old_rig, visit, "complaints", [urgent])
         assert post(old_rig, f"/api/visits/{visit['id']}/finish")["outcome"]["code"] == "refer_today"
-        post(old_rig, f"/api/visits/{visit['id']}/reopen")
+        post(old_rig, f"/api/visits/{visit['id']}/reopen", reason="answer")
 
 
 @pytest.mark.parametrize("number", ["x" * 21, "../a", "a b", "", "\ud800", "<b>", "A00012", "٣٤"])

@@ -93,7 +93,8 @@ const examActions = {
     set({ asking: "" });
     if (slot) goToAim(slot);
   },
-  reopen: () => visits.reopen(),
+  reopen: (reason) => visits.reopen(reason),
+  loadChanges: () => visits.loadChanges(),
   backToOutcome: () => navigate({ screen: "outcome", visit: currentRoute().visit }),
   moveToOtherEye: (slot, capture) => visits.moveToOtherEye(slot, capture),
   print: () => window.print(),

@@ -60,6 +60,7 @@ async function requestJson(path, options = {}) {
 export const getStatus = () => requestJson("/api/status");
 export const getProgramme = () => requestJson("/api/programme");
 export const getVisit = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}`);
+export const getChanges = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}/changes`);
 const montageUrl = (visit, eye) => `/api/visits/${encodeURIComponent(visit)}/montage/${encodeURIComponent(eye)}`;
 export const getMontage = (visit, eye) => requestJson(montageUrl(visit, eye));
 export const montagePictureUrl = (visit, eye, digest) => `${montageUrl(visit, eye)}/picture.png?${digest}`;

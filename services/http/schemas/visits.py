@@ -8,7 +8,8 @@ from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBo
 from services.http.schemas.problems import ErrorText
 from services.instrument.visit_montage import MontageState
 from services.records.json_values import FormValue
-from services.records.visit_document import VisitDocument
+from services.records.visit import ReopenReason
+from services.records.visit_document import VisitChange, VisitDocument
 
 
 class NewVisit(IdempotentRequest):
@@ -36,6 +37,18 @@ class SlotChoice(IdempotentRequest):
 
     slot: SlotName
     capture: RecordId | None
+
+
+class Reopening(IdempotentRequest):
+    """Request body: why a finished visit is opened again."""
+
+    reason: ReopenReason
+
+
+class ChangeList(ResponseBody):
+    """History of a visit, the first change first."""
+
+    changes: list[VisitChange]
 
 
 class ControlRequest(IdempotentRequest):
