@@ -10,7 +10,8 @@ import typer
 from device.clock import SystemClock
 from device.errors import SpecError
 from device.user_files import read_text
-from services.records.store_command import Data, app, table
+from services.backup.store_command import Data, app, table
+from services.identity.audit_key import find_audit_key
 from services.running_time import announcing, say
 
 if TYPE_CHECKING:
@@ -79,8 +80,9 @@ def restore(
             say(f"Backup {damaged} is damaged; an older one is restored.")
         for unit in found.damaged_units:
             say(f"Damaged in the backup, not restored: {unit}")
-        CaptureStore(data).close()  # migrates the tables; where a record file is newer than its row, restores the row
-        results = check_store(data, lambda line: say(f"{line} ..."))
+        key = find_audit_key(data)  # that of the restored store
+        CaptureStore(data, key=key).close()  # migrates the tables; restores a row that is older than its file
+        results = check_store(data, lambda line: say(f"{line} ..."), key)
     typer.echo(table(results))
     typer.echo(f"Backup {found.number} of {found.made_at:%Y-%m-%d %H:%M} UTC is restored in {data}.")
     if found.damaged_units or found.damaged_backups or not all(result.is_whole for result in results):

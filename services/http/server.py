@@ -55,8 +55,10 @@ from services.records.audit_log import AuditLog
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.programme import Programme
 from services.records.read_only_store import opened_store
+from services.records.schema import DATABASE
 from services.records.visit_repository import VisitRepository
 
 log = logging.getLogger(__name__)
@@ -158,7 +160,8 @@ def serve(
     """
     return_freed_arrays()
     clock = SystemClock()
-    with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
+    key = _audit_key(data)
+    with _Stop() as stop, address, opened_store(data, clock, key) as store, ExitStack() as undo, _limited_logs(clock):
         require_protection(address, UserTable(data / FOLDER), certificate)
         data = store.folder  # of a read-only store: its copy in memory
         programme = _with_own_numbers(programme, store)
@@ -186,7 +189,7 @@ def serve(
             own_host_names() + host_names,
             technician_routers=routers,
             uploader=uploader,
-            audit_log=_audit_log(store, clock),
+            audit_log=_audit_log(store, key, clock),
         )
         _log_start(app.http.version, store)
         server = _limited_server(app.http, clock, context.event_bus, certificate)
@@ -196,14 +199,27 @@ def serve(
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
 
 
-def _audit_log(store: CaptureStore, clock: Clock) -> AuditLog | None:
-    """Return the audit log of a store, None without a key that can be read or on a disk that takes no changes."""
-    if store.refusal is not None:
-        return None
+def _audit_key(data: Path) -> bytes | None:
+    """Return the key of a data folder, made at the first start; None, and a line in the log, if it cannot be read.
+
+    StoreError for a folder of a version before the first release, in which nothing is written.
+    """
+    refuse_earlier_store(data / DATABASE)
     try:
-        audit_log = AuditLog(store.folder, load_or_create_audit_key(store.folder), clock)
-        audit_log.append("", "start", version=version("diffuscope"))
+        return load_or_create_audit_key(data)
     except (OSError, StoreDamaged) as error:
+        log.error("no audit log is kept, and no file of a record is authenticated: %s", error)
+        return None
+
+
+def _audit_log(store: CaptureStore, key: bytes | None, clock: Clock) -> AuditLog | None:
+    """Return the audit log of a store, None without a key or on a disk that takes no changes."""
+    if store.refusal is not None or key is None:
+        return None
+    audit_log = AuditLog(store.folder, key, clock)
+    try:
+        audit_log.append("", "start", version=version("diffuscope"))
+    except OSError as error:
         log.error("no audit log is kept: %s", error)
         return None
     return audit_log

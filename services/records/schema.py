@@ -383,12 +383,14 @@ def record_key(row: RecordRow) -> str:
     return row.number if isinstance(row, PatientRow) else row.id
 
 
-def open_engine(path: Path) -> Engine:
+def open_engine(path: Path, key: bytes | None = None) -> Engine:
     """Return an engine for one SQLite file, usable from any thread; transactions of `for_writing` are serialised.
+
+    `key`: authenticates the files beside the tables, see `key_of`.
 
     The driver's own transaction handling is off: its commit before each schema change would split a migration.
     """
-    engine = create_engine(URL.create("sqlite", database=str(path)))
+    engine = create_engine(URL.create("sqlite", database=str(path)), execution_options={"file_key": key})
     event.listen(engine, "connect", _prepare)
     event.listen(engine, "begin", _begin)
     return engine
@@ -404,6 +406,12 @@ def make_private(database: Path) -> None:
 def folder_of(engine: Engine) -> Path:
     """Return the folder of the store whose tables these are."""
     return Path(str(engine.url.database)).parent
+
+
+def key_of(engine: Engine) -> bytes | None:
+    """Return the key that authenticates the files of the store whose tables these are; None without one."""
+    key: bytes | None = engine.get_execution_options()["file_key"]
+    return key
 
 
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from services.identity.audit_key import find_audit_key
 from services.running_time import announced, announcing, say
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def check(
     """Read everything that is stored, change nothing, and name what is damaged; exit status 1 if something is."""
     from services.records.store_check import check_store  # deferred: imports SQLAlchemy
 
-    results = check_store(data, lambda line: say(f"{line} ..."))
+    results = check_store(data, lambda line: say(f"{line} ..."), find_audit_key(data))
     typer.echo(json.dumps([asdict(result) for result in results], indent=1) if as_json else table(results))
     if not all(result.is_whole for result in results):
         sys.exit(1)
@@ -47,7 +48,7 @@ def rebuild(
     with announcing("rebuilding the database"):
         with storage_errors():
             aside = rebuild_database(data)
-        with CaptureStore(data) as store:
+        with CaptureStore(data, key=find_audit_key(data)) as store:
             report = store.recovery
     counts = f"{len(report.patients)} patients, {len(report.visits)} visits and {len(report.adopted)} captures"
     typer.echo(f"The database has {counts} from the files. The one before is in {aside}.")
