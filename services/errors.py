@@ -54,6 +54,7 @@ DiffuscopeError                       base class in device/errors.py
     ├── UpdateDamaged                 file incomplete or changed
     ├── UpdateWrongDevice             made for another device type
     ├── UpdateOlder                   not newer than the running version
+    ├── UpdateStale                   old file of the update channel
     ├── UpdateStepMissing             needs an intermediate version
     ├── UpdateNoRoom                  no space for the update
     └── UpdateFailed                  write or trial of the update failed
@@ -425,6 +426,13 @@ class UpdateOlder(UpdateError):
 
     code = "update.older"
     default_remedy = "Nothing needs to be done: this device has that version or a newer one."
+
+
+class UpdateStale(UpdateError):
+    """The update channel has an old file: another was seen before, or its last day is over."""
+
+    code = "update.stale"
+    default_remedy = "Look whether the date of this device is right, then tell the maker; or use a USB stick."
 
 
 class UpdateStepMissing(UpdateError):
