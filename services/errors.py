@@ -16,6 +16,8 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── CrossOriginRequest            cross-origin request (CSRF check)
 │   ├── UntrustedHost                 Host header is not a name of the instrument
 │   ├── ServerFull                    too many clients at once
+│   ├── ClockRefused                  the clock has a source already
+│   ├── ClockBackwards                a time before that of the device
 │   ├── TooManyRequests               more often than the rate of an operation
 │   ├── IdempotencyKeyConflict        idempotency key of another request
 │   ├── VisitFinished                 the visit is finished
@@ -172,6 +174,20 @@ class TooManyRequests(RequestRefused):
 
     code = "link.often"
     default_remedy = "Wait until the time is over, then try again. If you did nothing so often, call the technician."
+
+
+class ClockRefused(RequestRefused):
+    """The clock of the device has a source, or the time is impossible."""
+
+    code = "clock.refused"
+    default_remedy = "Set date and time in the settings of this computer, or connect it to a network."
+
+
+class ClockBackwards(RequestRefused):
+    """The time is before that of the device."""
+
+    code = "clock.back"
+    default_remedy = "Look whether the date of this screen is right. Only an administrator sets the clock back."
 
 
 class VisitFinished(RequestRefused):

@@ -66,6 +66,8 @@ ACCESS: dict[str, Access] = {
     "GET /api/status": MONITORED,
     "GET /api/health": MONITORED,
     "GET /api/programme": ANY_USER,
+    "POST /api/clock": ANY_USER,
+    "POST /api/clock/back": USERS,
     "GET /api/events": ANY_USER,
     "POST /api/controller": SCREEN,
     "GET /api/preview": LIGHT,

@@ -4,6 +4,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 
 from fastapi import APIRouter, Depends, FastAPI
 
@@ -24,6 +25,7 @@ from services.http.rate_limits import RATES, Rate, RateLimits
 from services.http.routes.audit import audit_router
 from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
+from services.http.routes.clock import clock_router
 from services.http.routes.events import event_router
 from services.http.routes.exports import exports_router
 from services.http.routes.login import login_router
@@ -76,6 +78,7 @@ def create_app(
     preview_limits: ClientLimits = PREVIEW_LIMITS,
     audit_log: AuditLog | None = None,
     rates: Mapping[str, Rate] = RATES,
+    system: Path = Path("/"),
 ) -> Application:
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
@@ -83,7 +86,8 @@ def create_app(
     name of this computer. `programme` None loads the default programme. `technician_routers` are those of the
     technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
-    `audit_log`: None keeps none. `rates`: limits of operations in time.
+    `audit_log`: None keeps none. `rates`: limits of operations in time. `system`: root of the file system, from which
+    the source of the clock is read.
     """
     store = arbiter.context.store
     clock = arbiter.context.clock
@@ -92,7 +96,7 @@ def create_app(
     queue = UploadQueue(store.engine, clock)
     pack = archive_builder(store, visits)
     worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
-    alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue)
+    alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue, system)
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.owner.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
@@ -115,6 +119,7 @@ def create_app(
     app.include_router(login_router(authenticator))
     app.include_router(users_router(authenticator.users))
     app.include_router(audit_router(audit_log))
+    app.include_router(clock_router(clock, system))
     app.include_router(calibration_router(arbiter))
     for router in (*technician_routers, removal_routes(PictureRemoval(store, visits, clock))):
         app.include_router(router)
@@ -123,11 +128,11 @@ def create_app(
 
 
 def _alert_monitor(
-    arbiter: HeadArbiter, visits: VisitRepository, lease: ControlLease, queue: UploadQueue | None
+    arbiter: HeadArbiter, visits: VisitRepository, lease: ControlLease, queue: UploadQueue | None, system: Path
 ) -> AlertMonitor:
     """Return the monitor of the alerts of an application; `queue` None: nothing is uploaded."""
     context = arbiter.context
-    sources = AlertSources(lambda: read_status(arbiter), context.store, visits, lambda: lease.holder, queue)
+    sources = AlertSources(lambda: read_status(arbiter), context.store, visits, lambda: lease.holder, queue, system)
     return AlertMonitor(sources, context.clock, context.event_bus.publish)
 
 

@@ -23,6 +23,8 @@ ACTIONS = {
     "POST /api/users": "add-user",
     "PATCH /api/users/{name}": "change-user",
     "DELETE /api/users/{name}": "remove-user",
+    "POST /api/clock": "set-clock",
+    "POST /api/clock/back": "set-clock-back",
     "POST /api/visits": "begin-visit",
     "GET /api/visits/{id}": VIEW,
     "GET /api/visits/{id}/changes": VIEW,

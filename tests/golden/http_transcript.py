@@ -260,6 +260,7 @@ def access() -> list[dict[str, Any]]:
         log.ask("GET /api/login")
         _users(log)
         log.ask("GET /api/audit", "/api/audit?action=sign-in&limit=2")
+        _clock(log)
         log.ask("POST /api/login/activity")
         log.ask("POST /api/login/confirm", json={"secret": "000000"})
         device.clock.elapsed_s += 2
@@ -282,6 +283,17 @@ def access() -> list[dict[str, Any]]:
         device.clock.elapsed_s += 400
         log.ask("GET /api/login", note="after the idle lock")
         return log.exchanges
+
+
+def _clock(log: Transcript) -> None:
+    """Record the acceptance of a tablet's time, at a device that has one and at a device that has none."""
+    later, earlier = {"now": "2027-01-01T12:00:00+05:30"}, {"now": "2026-01-01T05:30:00+05:30"}
+    log.ask("POST /api/clock", json=log.key(**later), note="nothing sets the clock")
+    log.ask("POST /api/clock/back", json=log.key(**earlier), note="nothing sets the clock")
+    (log.instrument.folder / "system/run/diffuscope-clock").mkdir(parents=True)
+    log.ask("POST /api/clock", json=log.key(**earlier), note="before the time of the device")
+    log.ask("POST /api/clock", json=log.key(**later))
+    log.ask("POST /api/clock/back", json=log.key(**earlier))
 
 
 def _users(log: Transcript) -> None:

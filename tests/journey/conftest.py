@@ -235,7 +235,9 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = Authenticator(folder / "access", clock, has_demo=True)
         # Virtual time stands still, so that tests would reach the limits in rate.
-        build_app = partial(create_app, owner, door, programme, uploader=carrier, usb_drives=sticks, rates={})
+        build_app = partial(
+            create_app, owner, door, programme, uploader=carrier, usb_drives=sticks, rates={}, system=folder / "system"
+        )
         clock.world = scene
         return Rig(scene, clock, records, event_bus, exam, owner, door, build_app, died)
 

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from device.clock import VirtualClock
 from services.errors import AuthenticationError
+from services.health.clock_request import REQUEST
 from services.http.access import ACCESS, Access
 from services.http.app import create_app
 from services.http.authentication import OWN_SCREEN, Authenticator, Peer
@@ -301,6 +303,34 @@ def test_operations_are_limited_in_rate(operation: str, fresh: Rig) -> None:
     fresh.clock.sleep(rate.interval_s)
     assert ask_as(tokens[0])[0] != 429
     assert ask_as(tokens[0])[0] == 429
+
+
+def test_the_time_of_a_tablet_is_accepted_forward_and_an_administrator_sets_it_back(fresh: Rig, tmp_path: Path) -> None:
+    """The request for the unit that sets the clock, and an entry with both times."""
+    log, request = AuditLog(tmp_path, b"k" * 32, fresh.clock), tmp_path / REQUEST
+    fresh.clock.start += timedelta(days=60)  # after the earliest possible date
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log, system=tmp_path).http
+    fresh.authenticator.users.add("Asha", PIN, ["administrator"])
+    fresh.authenticator.users.add("Ravi", PIN, ["reader"])
+    asha, ravi = (fresh.authenticator.sign_in(name, PIN, OWN_SCREEN) for name in ("Asha", "Ravi"))
+    request.parent.mkdir(parents=True)
+    present = fresh.clock.wall()
+    later, earlier = ((present + timedelta(days=days)).isoformat() for days in (9, -9))
+
+    def ask_as(token: str, now: str, path: str = "/api/clock") -> tuple[int, str | None]:
+        answer = ask(app, "POST", path, token, json={"key": "0" * 16, "now": now})
+        return answer.status_code, answer.json().get("code")
+
+    assert ask_as(ravi, earlier) == (409, "clock.back")
+    assert ask_as(ravi, earlier, "/api/clock/back")[0] == 403
+    assert not request.exists()
+    assert ask_as(ravi, later) == (200, None)
+    assert datetime.fromisoformat(request.read_text()) == present + timedelta(days=9)
+    assert ask_as(asha, earlier, "/api/clock/back") == (200, None)
+    assert request.read_text().startswith("back ")
+    fields = [(entry.user, entry.action, entry.more["field"]) for entry in log.entries(2)]
+    both = f"{present.isoformat()} "
+    assert fields == [("Asha", "set-clock-back", both + earlier), ("Ravi", "set-clock", both + later)]
 
 
 def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:

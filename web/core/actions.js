@@ -1,6 +1,6 @@
 // User actions by tap or key: one object of handlers that templates and keyboard share.
 
-import { fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
+import { acceptTime, fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
 import { get, otherEyeSlot, saveSetting, set, currentCapture } from "./state.js";
 import { applyKey, isNumber } from "./numbers.js";
@@ -175,6 +175,12 @@ const alertButtons = {
   ok: ({ code }) => lowerAlert(code),
   later: dismissAlert,
   dateIsRight: dismissAlert,
+  timeIsRight: async (alert) => {
+    if (await visits.alertOnError(() => acceptTime())) dismissAlert(alert);
+  },
+  setClock: async (alert) => {
+    if (await visits.alertOnError(() => acceptTime("/back"))) dismissAlert(alert);
+  },
   retry: refreshStatus,
   useHere: async () => {
     const answer = await visits.alertOnError(() => requestControl(true));

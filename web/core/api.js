@@ -90,12 +90,11 @@ export function send(method, path, { key = newIdempotencyKey(), ...body } = {}) 
   });
 }
 
-/**
- * Request or renew the control lease, which one page holds at a time; `take` takes it from another page. A device whose
- * clock is not set takes the time of this browser.
- */
-export const requestControl = (take) =>
-  send("POST", "/api/controller", { key: controllerKey(), now: new Date().toISOString(), ...(take && { take }) });
+/** Set the clock of the device to that of this screen; `how` "/back": backwards or once more, as an administrator. */
+export const acceptTime = (how = "") => send("POST", `/api/clock${how}`, { now: new Date().toISOString() });
+
+/** Request or renew the control lease, which one page holds at a time; `take` takes it from another page. */
+export const requestControl = (take) => send("POST", "/api/controller", { key: controllerKey(), ...(take && { take }) });
 
 /** Release the control lease when the page closes; a beacon is sent even after the page is gone. */
 export const releaseControl = () =>

@@ -5,7 +5,6 @@ from datetime import date
 
 from fastapi import APIRouter, Query, Request
 
-from services.health.clock_request import offer_time
 from services.http.access import signed_in
 from services.http.control_lease import ControlLease
 from services.http.schemas.captures import LateralityCorrection
@@ -193,8 +192,6 @@ def _lease_router(lease: ControlLease) -> APIRouter:
 
         Answers with the public name of the present or last holder (`lease`) and whether this screen holds it (`mine`).
         """
-        if asking.now is not None:
-            offer_time(asking.now)
         state = lease.release(asking.key) if asking.release else lease.acquire(asking.key, asking.take)
         return LeaseAnswer(lease=state.lease, mine=state.mine)
 

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import Field
 
 from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName
 from services.http.schemas.problems import ErrorText
@@ -54,13 +54,11 @@ class ChangeList(ResponseBody):
 class ControlRequest(IdempotentRequest):
     """Request body of the control lease; `key` is the secret key of the screen.
 
-    `take` takes the lease from another screen, `release` lets it expire. `now`: time of the browser, which the device
-    takes if nothing else has set its clock.
+    `take` takes the lease from another screen, `release` lets it expire.
     """
 
     take: bool = False
     release: bool = False
-    now: AwareDatetime | None = None
 
 
 class LeaseAnswer(ResponseBody):
