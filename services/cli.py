@@ -112,7 +112,7 @@ def run(
     certificate_key: Annotated[Path | None, typer.Option(help="Private key of the certificate, as PEM.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
     programme: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
-    name: Annotated[list[str] | None, typer.Option(help="A name of this computer in the network.")] = None,
+    name: Annotated[list[str] | None, typer.Option(help="A further name of this computer, or of a proxy.")] = None,
     updates: Annotated[
         Path | None, typer.Option(help="The updater's folder, for the page to show.", readable=False)
     ] = None,

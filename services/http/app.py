@@ -82,8 +82,8 @@ def create_app(
 ) -> Application:
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
-    `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
-    name of this computer. `programme` None loads the default programme. `technician_routers` are those of the
+    `host_names` are the host names that the server accepts, beside localhost and the address of the connection; None:
+    those of this computer. `programme` None loads the default programme. `technician_routers` are those of the
     technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
     `audit_log`: None keeps none. `rates`: limits of operations in time. `system`: root of the file system, from which

@@ -153,7 +153,7 @@ def serve(
 
     The page is available while the exam still plans its FFTs; an error that stopped the server is raised at the end.
     `data`: data folder. `ready` takes whether the page asks for the set-up code of the first user. `host_names`:
-    accepted host names beside the own and local ones. `measure`: the frontier measurement of this device. `updater`:
+    accepted host names beside the own ones. `measure`: the frontier measurement of this device. `updater`:
     the updater's state folder and its request folder. `uploader`: uploads to the receiver. `certificate`: of TLS, None
     for plain HTTP. Everything that was opened is closed at every exit. InputError for an address beyond this computer
     without users and TLS, SystemExit(0) for a signal before the server runs.

@@ -113,7 +113,7 @@ class Rig:
             transport = httpx.ASGITransport(app=self.app, **options)
             own = {"Sec-Fetch-Site": "same-origin"}  # header of a same-origin page
             async with httpx.AsyncClient(
-                transport=transport, base_url="http://eye.local", timeout=30, headers=own
+                transport=transport, base_url="http://diffuscope.local", timeout=30, headers=own
             ) as client:
                 return await use_client(client)
 

@@ -37,7 +37,7 @@ def ask(
     async def send() -> httpx.Response:
         transport = httpx.ASGITransport(app=app, client=client)
         headers = {"X-Controller": "test"} | ({} if token is None else {"Cookie": f"login={token}"})
-        async with httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30) as browser:
+        async with httpx.AsyncClient(transport=transport, base_url="http://diffuscope.local", timeout=30) as browser:
             return await browser.request(method, path, headers=headers | options.pop("headers", {}), **options)
 
     return asyncio.run(send())
@@ -193,7 +193,7 @@ def test_over_tls_the_cookie_is_bound_to_the_host(fresh: Rig) -> None:
 
     async def cookie() -> str:
         transport = httpx.ASGITransport(app=fresh.app, client=AWAY)
-        async with httpx.AsyncClient(transport=transport, base_url="https://eye.local") as browser:
+        async with httpx.AsyncClient(transport=transport, base_url="https://diffuscope.local") as browser:
             answer = await browser.post("/api/login", json={"name": "Asha", "secret": PIN})
             return answer.headers["set-cookie"]
 
@@ -258,7 +258,7 @@ def test_a_risk_needs_the_secret_again_and_polling_does_not_extend_a_login(fresh
 def test_an_event_stream_ends_with_its_login(fresh: Rig) -> None:
     fresh.authenticator.users.add("Asha", PIN, ["reader", "administrator"])
     token = fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)
-    cookie = {"Cookie": f"login={token}", "Host": "eye.local"}
+    cookie = {"Cookie": f"login={token}", "Host": "diffuscope.local"}
 
     def sign_out() -> None:
         fresh.authenticator.logins.end(token)

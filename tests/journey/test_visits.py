@@ -3,12 +3,14 @@
 import asyncio
 import json
 from itertools import count
+from socket import gethostname
 from typing import Any
 
 import httpx
 import pytest
 
 from device.sim import calibration_targets
+from services.http.security import is_trusted_host
 from services.instrument.exam_requests import WANTED_S
 from tests.journey.asking import record_answer
 from tests.journey.conftest import until
@@ -419,7 +421,7 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "origin", ["http://evil.example", "null", "http://eye.local:81", "https://[", "http://eye.localx"]
+    "origin", ["http://evil.example", "null", "http://diffuscope.local:81", "https://[", "http://diffuscope.localx"]
 )
 def test_a_cross_origin_change_is_403(old_rig: Any, origin: str) -> None:
     before = old_rig.request("GET", "/api/visits").json()
@@ -428,7 +430,7 @@ def test_a_cross_origin_change_is_403(old_rig: Any, origin: str) -> None:
         refused(answer, 403, "link.forged")
         assert "default-src 'none'" in answer.headers["content-security-policy"]
     assert old_rig.request("GET", "/api/visits").json() == before
-    own = {"Origin": "http://eye.local"}
+    own = {"Origin": "http://diffuscope.local"}
     assert old_rig.request("POST", "/api/visits", json={"key": next(keys)}, headers=own).status_code == 201
 
 
@@ -436,19 +438,31 @@ def test_untrusted_host_names_are_refused(old_rig: Any) -> None:
     def status(host: str) -> int:
         return int(old_rig.request("GET", "/api/health", headers={"Host": host}).status_code)
 
-    own = ["10.42.0.1", "10.42.0.1:8000", "[::1]:8000", "localhost:8000", "eye.local", "EYE.LOCAL", "eye.local:80"]
+    own = ["127.0.0.1:8000", "[::1]:8000", "localhost:8000", "diffuscope.local", "DIFFUSCOPE.LOCAL:80"]
+    own.append(f"{gethostname()}.local")
     assert {host: status(host) for host in own} == dict.fromkeys(own, 200)
     foreign = [
         "evil.example",
-        "eye.local.evil.example",
+        "diffuscope.local.evil.example",
         "localhost.evil.example",
-        "eye.local:x",
+        "diffuscope.local:x",
         "[",
+        "other.local",
+        "10.42.0.1",
+        "8.8.8.8",
         "10.42.0.1.evil",
         "",
     ]
     assert {host: status(host) for host in foreign} == dict.fromkeys(foreign, 400)
     refused(old_rig.request("GET", "/", headers={"Host": "evil.example"}), 400, "link.host")
+
+
+@pytest.mark.parametrize("address", ["10.42.0.1", "::ffff:10.42.0.1"])
+def test_the_address_that_a_connection_came_to_is_a_name(address: str) -> None:
+    """No other one: the address of a router that forwards a port is no name of the device."""
+    assert is_trusted_host("10.42.0.1:8000", frozenset(), address)
+    assert not is_trusted_host("10.42.0.2:8000", frozenset(), address)
+    assert not is_trusted_host("10.42.0.1", frozenset(), "/run/socket")
 
 
 def test_many_tabs_at_once_get_different_numbers(old_rig: Any) -> None:
