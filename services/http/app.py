@@ -103,7 +103,7 @@ def create_app(
     app = _http_application(
         life, authenticator, own_host_names() if host_names is None else host_names, RateLimits(rates, clock)
     )
-    app.add_middleware(AuditTrail, audit_log=audit_log, clock=clock)
+    app.add_middleware(AuditTrail, audit_log=audit_log, clock=clock, system=system)
     pending = PendingCaptures()
     controlled = [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)

@@ -2,12 +2,14 @@
 
 import logging
 from collections.abc import Callable
+from pathlib import Path
 
 from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from device.clock import Clock
 from device.errors import DiffuscopeError
+from services.health.clock_source import clock_state
 from services.records.audit_log import AuditLog
 
 log = logging.getLogger(__name__)
@@ -56,11 +58,13 @@ Append = Callable[..., None]
 class AuditTrail:
     """ASGI middleware that records the actions of `ACTIONS`, also refused ones, with user, record and HTTP status.
 
-    `audit_log` None records nothing. A log that cannot be written is reported in the event log; requests go on.
+    With the source of the clock (clock_source.py), since the time of an entry is as good as that. `audit_log` None
+    records nothing. `system`: root of the file system. A log that cannot be written is reported in the event log;
+    requests go on.
     """
 
-    def __init__(self, app: ASGIApp, audit_log: AuditLog | None, clock: Clock) -> None:
-        self.app, self._log, self._clock = app, audit_log, clock
+    def __init__(self, app: ASGIApp, audit_log: AuditLog | None, clock: Clock, system: Path) -> None:
+        self.app, self._log, self._clock, self._system = app, audit_log, clock, system
         self._viewed_s: dict[tuple[str, str], float] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -85,6 +89,7 @@ class AuditTrail:
         if action == VIEW and not self._is_new_view(name, record, status):
             return
         more = {"status": str(status), "field": state.get("audit_field", ""), "from": state.get("audit_address", "")}
+        more["clock"] = clock_state(self._system)
         try:
             await run_in_threadpool(self._log.append, name, action, record, **more)
         except (OSError, DiffuscopeError) as error:

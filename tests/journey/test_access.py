@@ -336,7 +336,7 @@ def test_the_time_of_a_tablet_is_accepted_forward_and_an_administrator_sets_it_b
 def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:
     """Sign-in, its failure, view, change, refused light: user, record and field, and no value."""
     log = AuditLog(tmp_path, b"k" * 32, fresh.clock)
-    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log, system=tmp_path).http
     fresh.authenticator.users.add("Asha", PIN, ROLES)
     ask(app, "POST", "/api/login", json={"name": "Asha", "secret": "000000"})
     fresh.clock.sleep(1)
@@ -358,6 +358,7 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
         ("Asha", "capture", visit, None, "409"),
         ("", "view", visit, None, "401"),
     ]
+    assert {one.more["clock"] for one in log.entries(100)} == {"not_set"}
     assert b"Meena" not in (tmp_path / "audit-log.jsonl").read_bytes()
     shown = ask(app, "GET", "/api/audit?action=sign-in", token).json()
     assert ([entry["number"] for entry in shown["entries"]], shown["problem"]) == ([2, 1], None)
