@@ -15,7 +15,9 @@ from services.records.audit_log import AuditLog
 log = logging.getLogger(__name__)
 
 VIEW = "view"
-VIEW_AGAIN_S = 300.0  # a page reads what it shows again and again: one entry for each user and record in this time
+# A page reads what it shows again and again: one entry for each user and record in this time. And a stranger, who asks
+# without end, gets one for each address and action, since each entry is written with fsync.
+AGAIN_S = 300.0
 ACTIONS = {
     "POST /api/login": "sign-in",
     "DELETE /api/login": "sign-out",
@@ -65,7 +67,7 @@ class AuditTrail:
 
     def __init__(self, app: ASGIApp, audit_log: AuditLog | None, clock: Clock, system: Path) -> None:
         self.app, self._log, self._clock, self._system = app, audit_log, clock, system
-        self._viewed_s: dict[tuple[str, str], float] = {}
+        self._recorded_s: dict[tuple[str, ...], float] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass one ASGI request to the application, and record its action before the answer begins."""
@@ -86,22 +88,23 @@ class AuditTrail:
         name = state.get("audit_user") or ("" if user is None else user.name)
         parameters = scope.get("path_params", {})
         record = str(parameters.get("id") or parameters.get("name") or state.get("audit_record", ""))
-        if action == VIEW and not self._is_new_view(name, record, status):
+        address = state.get("audit_address", "")
+        if not name and not self._is_new(address, action):
             return
-        more = {"status": str(status), "field": state.get("audit_field", ""), "from": state.get("audit_address", "")}
+        if action == VIEW and status < 400 and not self._is_new(name, record):
+            return
+        more = {"status": str(status), "field": state.get("audit_field", ""), "from": address}
         more["clock"] = clock_state(self._system)
         try:
             await run_in_threadpool(self._log.append, name, action, record, **more)
         except (OSError, DiffuscopeError) as error:
             log.error("the audit log cannot be written: %s", error)
 
-    def _is_new_view(self, name: str, record: str, status: int) -> bool:
-        """Return whether a view of this record by this user is to be recorded: each refused one, else the first."""
-        if status >= 400:
-            return True
+    def _is_new(self, *what: str) -> bool:
+        """Return whether the same was not recorded within AGAIN_S."""
         now_s = self._clock.now_s()
-        self._viewed_s = {key: at_s for key, at_s in self._viewed_s.items() if now_s - at_s < VIEW_AGAIN_S}
-        is_new = (name, record) not in self._viewed_s
+        self._recorded_s = {key: at_s for key, at_s in self._recorded_s.items() if now_s - at_s < AGAIN_S}
+        is_new = what not in self._recorded_s
         if is_new:
-            self._viewed_s[name, record] = now_s
+            self._recorded_s[what] = now_s
         return is_new
