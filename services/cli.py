@@ -102,11 +102,17 @@ def run(
     replay: Annotated[Path | None, typer.Option(help="Folder with a recording, played instead of a head.")] = None,
     raw: Annotated[list[Path] | None, typer.Option(help="Raw frames of a recording, with --psf.")] = None,
     psf: Annotated[list[Path] | None, typer.Option(help="PSF of a recording; several, or a folder: a stack.")] = None,
-    host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network, with users and --certificate.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Certificate of TLS with its chain, as PEM; needed beyond this computer.")
+    ] = None,
+    certificate_key: Annotated[Path | None, typer.Option(help="Private key of the certificate, as PEM.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
     programme: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
-    name: Annotated[list[str] | None, typer.Option(help="A name of this computer in the network.")] = None,
+    name: Annotated[list[str] | None, typer.Option(help="A further name of this computer, or of a proxy.")] = None,
     updates: Annotated[
         Path | None, typer.Option(help="The updater's folder, for the page to show.", readable=False)
     ] = None,
@@ -117,7 +123,7 @@ def run(
 ) -> None:
     """Serve the page: one button, one true picture."""
     from services.delivery.uploader import HttpsUploader, load_settings
-    from services.http.server import base_url, bind_socket, inherited_socket, serve  # web stack: this command only
+    from services.http.server import Certificate, base_url, bind_socket, inherited_socket, serve  # web stack: here only
     from services.instrument.watchdog import Watchdog
     from services.records.programme import DEFAULT_PROGRAMME, load_programme
     from services.research.frontier import measure_scene
@@ -129,9 +135,12 @@ def run(
     address = inherited_socket(os.environ) or bind_socket(host, port)
     served, at = address.getsockname()[:2]
     folder = data or _default_data()
+    if (certificate is None) != (certificate_key is None):
+        raise typer.BadParameter("--certificate and --certificate-key belong together: give both, or none")
+    tls = Certificate(certificate, certificate_key) if certificate is not None and certificate_key is not None else None
 
     def ready(needs_setup: bool) -> None:
-        typer.echo(f"Open {base_url(served, at)} in a browser")
+        typer.echo(f"Open {base_url(served, at, tls is not None)} in a browser")
         if needs_setup:
             typer.echo(f"It asks for the set-up code, which `diffuscope users list --data {folder}` prints")
 
@@ -146,6 +155,7 @@ def run(
         tuple(name or ()),
         (updates, update_requests),
         uploader,
+        tls,
     )
 
 

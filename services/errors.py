@@ -16,6 +16,9 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── CrossOriginRequest            cross-origin request (CSRF check)
 │   ├── UntrustedHost                 Host header is not a name of the instrument
 │   ├── ServerFull                    too many clients at once
+│   ├── ClockRefused                  the clock has a source already
+│   ├── ClockBackwards                a time before that of the device
+│   ├── TooManyRequests               more often than the rate of an operation
 │   ├── IdempotencyKeyConflict        idempotency key of another request
 │   ├── VisitFinished                 the visit is finished
 │   ├── ConsentMissing                no consent recorded for the visit
@@ -53,6 +56,7 @@ DiffuscopeError                       base class in device/errors.py
     ├── UpdateDamaged                 file incomplete or changed
     ├── UpdateWrongDevice             made for another device type
     ├── UpdateOlder                   not newer than the running version
+    ├── UpdateStale                   old file of the update channel
     ├── UpdateStepMissing             needs an intermediate version
     ├── UpdateNoRoom                  no space for the update
     └── UpdateFailed                  write or trial of the update failed
@@ -163,6 +167,27 @@ class ServerFull(RequestRefused):
 
     code = "link.full"
     default_remedy = "Too many screens are connected. Close the page on the others, then wait a little."
+
+
+class TooManyRequests(RequestRefused):
+    """One client sends an operation more often than permitted; `wait_s` is the time until the next one."""
+
+    code = "link.often"
+    default_remedy = "Wait until the time is over, then try again. If you did nothing so often, call the technician."
+
+
+class ClockRefused(RequestRefused):
+    """The clock of the device has a source, or the time is impossible."""
+
+    code = "clock.refused"
+    default_remedy = "Set date and time in the settings of this computer, or connect it to a network."
+
+
+class ClockBackwards(RequestRefused):
+    """The time is before that of the device."""
+
+    code = "clock.back"
+    default_remedy = "Look whether the date of this screen is right. Only an administrator sets the clock back."
 
 
 class VisitFinished(RequestRefused):
@@ -417,6 +442,13 @@ class UpdateOlder(UpdateError):
 
     code = "update.older"
     default_remedy = "Nothing needs to be done: this device has that version or a newer one."
+
+
+class UpdateStale(UpdateError):
+    """The update channel has an old file: another was seen before, or its last day is over."""
+
+    code = "update.stale"
+    default_remedy = "Look whether the date of this device is right, then tell the maker; or use a USB stick."
 
 
 class UpdateStepMissing(UpdateError):

@@ -102,6 +102,13 @@ def missing_names(markdown: str) -> list[str]:
     ]
 
 
+def test_every_control_of_the_threat_model_names_its_test() -> None:
+    """A row without a test belongs to the section of threats without a control."""
+    table = [line for line in text(".github/THREAT_MODEL.md").splitlines() if line.startswith("| ")][1:]
+    assert len(table) > 40
+    assert not [line for line in table if not re.search(r"`tests/[\w/]+\.py::test_\w+` \|$", line)]
+
+
 def test_a_missing_name_is_noticed() -> None:
     gone = "`device.recon.gone` `services.research.frontier.gone` `gone.py` `core/gone.js`"
     assert missing_names(gone) == gone.replace("`", "").split()

@@ -272,7 +272,7 @@ def test_paths_in_a_readme_exist(readme: str) -> None:
     here = Path(readme).parent
     missing = []
     for path in sorted(named_paths(text(readme))):
-        at = [normpath(base / path.split("#")[0]) for base in (Path(), here)]
+        at = [normpath(base / re.split("#|::", path)[0]) for base in (Path(), here)]
         if not any(place in there or any(fnmatch(entry, place) for entry in there) for place in at):
             missing.append(path)
     assert not missing, f"{readme} names what is not there"

@@ -41,7 +41,7 @@ async function showRoute(route) {
   set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, qrCode: null });
   buttonsChanged();
   lowerAlert("link.slow");
-  if (route.screen !== "pictures" || route.visit !== before.visit) set({ montages: Object.freeze({}) });
+  if (route.screen !== "pictures" || route.visit !== before.visit) set({ montages: Object.freeze({}), changes: Object.freeze([]) });
   if (!same) set({ visits: null, folders: null, copied: null, zipped: false, blink: false });
   renewControl();
   await loadRoute(route);

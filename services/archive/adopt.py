@@ -16,6 +16,7 @@ from services.archive.plan import Plan, PlannedCapture, read_plan
 from services.archive.result import COLOUR_PICTURE, PICTURE, PLAN, ResultFolder, Stored, encoded_document
 from services.archive.solve import read_linear
 from services.errors import RecordNotFound, VersionRefused
+from services.identity.audit_key import find_audit_key
 from services.imaging.colour_rendering import render_colour
 from services.imaging.picture_files import DISPLAY, to_png
 from services.records import schema
@@ -65,7 +66,7 @@ def adopt_results(folder: Path, store: Path, clock: Clock, progress: Callable[[s
     with ExitStack() as undo:
         with storage_errors():
             refuse_in_use(store / schema.DATABASE)
-        kept = undo.enter_context(CaptureStore(store))
+        kept = undo.enter_context(CaptureStore(store, key=find_audit_key(store)))
         return _adopted(plan, results, kept, clock, progress)
 
 

@@ -4,7 +4,7 @@
         README.txt              how to restore
         backup.json             id and recipients, in the clear (backup_key.py); backup-copy.json is the same
         objects/<sha256>.age    one folder of the store (a capture), as an encrypted tar archive
-        index.txt               append-only: name of each backed-up content, and its object
+        index.txt               append-only: name of each backed-up content, its object, and a seal (backup_key.py)
         backups/<number>.age    one backup: everything else in the store, and the list of its objects
 
 An object is named by the SHA-256 of its encrypted content, so that a copy can be checked without a key. A line of the
@@ -19,12 +19,12 @@ from pathlib import Path
 
 from device import atomic_io
 from device.user_files import files_in
-from services.backup.backup_key import HEADER_FILES, BackupHeader, encoded_model, read_model
+from services.backup.backup_key import HEADER_FILES, BackupHeader, BackupKey, encoded_model, read_model
 from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
 
 PREFIX = "diffuscope-backup-"
-_LINE = re.compile(r"([0-9a-f]{64}) ([0-9a-f]{64}) ([0-9]+)")
+_LINE = re.compile(r"([0-9a-f]{64}) ([0-9a-f]{64}) ([0-9]+) [0-9a-f]{64}")
 README = """Backups of one Diffuscope device, encrypted with age (https://age-encryption.org).
 
 Restore them on a new device, with the passphrase or with the file of the secret key:
@@ -36,21 +36,22 @@ Every file in objects/ is named by its SHA-256. Remove nothing: later backups ne
 
 
 class BackupFolder:
-    """Folder of the backups with this header, below `place`; it is made if it is missing.
+    """Folder of the backups with this key, below `place`; it is made if it is missing.
 
     BackupDamaged if the folder there has the header of other backups. UsbDriveFull or UsbDriveUnavailable if the place
     refuses, here and in every method.
     """
 
-    def __init__(self, place: Path, header: BackupHeader) -> None:
-        self.folder = place / f"{PREFIX}{header.id}"
+    def __init__(self, place: Path, key: BackupKey) -> None:
+        self._key = key
+        self.folder = place / f"{PREFIX}{key.header.id}"
         self._objects, self._backups, self._index = (self.folder / name for name in ("objects", "backups", "index.txt"))
         with drive_errors(place):
             if not place.is_dir():
                 raise UsbDriveUnavailable(f"{place} is no folder that is there now")
             for folder in (self._objects, self._backups):
                 atomic_io.make_folder(folder)
-            self._write_header(header)
+            self._write_header(key.header)
             self._known = self._read_index()
 
     def object_of(self, name: str) -> str | None:
@@ -63,9 +64,9 @@ class BackupFolder:
         sha256 = hashlib.sha256(encrypted).hexdigest()
         with drive_errors(self.folder):
             _write_and_read_back(self._objects / f"{sha256}.age", encrypted)
-            line = f"\n{name} {sha256} {len(encrypted)}\n".encode()  # a torn line before it stays a line of its own
+            line = self._line(name, sha256, len(encrypted))
             with open(self._index, "ab", opener=atomic_io.private_opener) as index:
-                index.write(line)
+                index.write(f"\n{line}\n".encode())  # a torn line before it stays a line of its own
             atomic_io.fsync_file(self._index)
         self._known[name] = (sha256, len(encrypted))
         return sha256
@@ -107,12 +108,21 @@ class BackupFolder:
             if present != header:
                 raise BackupDamaged(f"{path} is not that of this device's backups")
 
+    def _line(self, name: str, sha256: str, length: int) -> str:
+        """Return a line of the index, sealed: a changed one could put a forged object into the next backup."""
+        line = f"{name} {sha256} {length}"
+        return f"{line} {self._key.seal(line.encode()).hex()}"
+
     def _read_index(self) -> dict[str, tuple[str, int]]:
-        """Return object and length by name; without torn lines, and without objects that are missing or incomplete."""
+        """Return object and length by name; without torn or forged lines, and missing or incomplete objects."""
         lines = self._index.read_text("ascii", "replace").splitlines() if self._index.exists() else []
         lengths = {path.stem: path.stat().st_size for path in files_in(self._objects, "*.age")}
-        found = [match.groups() for line in lines if (match := _LINE.fullmatch(line))]
-        return {name: (sha256, int(length)) for name, sha256, length in found if lengths.get(sha256) == int(length)}
+        found = [(*match.groups(), line) for line in lines if (match := _LINE.fullmatch(line))]
+        return {
+            name: (sha256, int(length))
+            for name, sha256, length, line in found
+            if lengths.get(sha256) == int(length) and line == self._line(name, sha256, int(length))
+        }
 
 
 def backup_numbers(folder: Path) -> list[int]:

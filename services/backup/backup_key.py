@@ -1,9 +1,10 @@
-"""Key of a device's backups: who can decrypt them, and a secret for the HMAC that names the contents in the index.
+"""Key of a device's backups: who can decrypt them, and a secret for the HMAC that names contents and seals lists.
 
 `backup.json` in the folder of the store (mode 600) and, without the secret, in the folder of the backups. Encryption is
 age's (X25519, https://age-encryption.org/v1): the device knows the public keys only, so a lost device decrypts no
-backup. With a passphrase, a new secret key is encrypted with it (scrypt) and stored beside the backups and in the
-device's own file.
+backup. With a passphrase, a new secret key is encrypted with it (scrypt), together with the secret, and stored beside
+the backups and in the device's own file. The public keys are in the clear, so anyone can encrypt a backup: the seal,
+which needs the secret, shows that the device wrote it. Holders of secret keys elsewhere keep the secret with them.
 """
 
 import base64
@@ -27,6 +28,7 @@ from services.records import digested_json
 
 KEY_FILE = "backup.json"
 HEADER_FILES = (KEY_FILE, "backup-copy.json")  # in a folder of backups: without the header no passphrase helps
+SEAL_BYTES = hashlib.sha256().digest_size
 MIN_PASSPHRASE = 8  # characters; scrypt makes each guess cost about a second
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -41,9 +43,13 @@ def _public_key(value: str) -> str:
 
 
 class SecretKey:
-    """Secret key of age; `text` is its line in a file of `age-keygen`. BackupKeyWrong if it is none."""
+    """Secret key of age, and the secret (hex) of the seals; `text`: its line in a file of `age-keygen`.
 
-    def __init__(self, text: str) -> None:
+    BackupKeyWrong if it is none.
+    """
+
+    def __init__(self, text: str, secret: str) -> None:
+        self._secret = secret
         try:
             self._identity = pyrage.x25519.Identity.from_str(text)
         except pyrage.IdentityError as error:
@@ -62,12 +68,20 @@ class SecretKey:
             raise BackupDamaged(f"cannot be decrypted: {error}") from error
         return decrypted
 
+    def opened(self, encrypted: bytes) -> bytes:
+        """Return the content of `BackupKey.sealed`, decrypted; BackupDamaged as above, or if another wrote it."""
+        sealed = self.decrypted(encrypted)
+        content, seal = sealed[:-SEAL_BYTES], sealed[-SEAL_BYTES:]
+        if not hmac.compare_digest(_seal(self._secret, content), seal):
+            raise BackupDamaged("the device of these backups did not write it: its seal differs")
+        return content
+
 
 class BackupHeader(BaseModel):
     """What the folder of the backups says in the clear: id, recipients, and the secret key behind a passphrase.
 
-    `recipients`: public keys of age. `sealed_identity`: their secret key, encrypted with the passphrase (Base64); empty
-    if the secret keys are elsewhere.
+    `recipients`: public keys of age. `sealed_identity`: their secret key and the secret, encrypted with the passphrase
+    (Base64); empty if the secret keys are elsewhere.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -101,23 +115,36 @@ class LastBackup(BaseModel):
 
 
 class BackupKey(BaseModel):
-    """Key of the backups of one device: header, secret (hex) of the names of what was backed up, and last backup."""
+    """Key of the backups of one device: header, secret (hex) of names and seals, and last backup."""
 
     model_config = ConfigDict(frozen=True)
 
     header: BackupHeader
-    naming_secret: str = Field(pattern=r"^[0-9a-f]{64}$")
+    secret: str = Field(pattern=r"^[0-9a-f]{64}$")
     last: LastBackup | None = None
 
     def name(self, fingerprint: bytes) -> str:
         """Return the name (HMAC-SHA256, hex) of a content with this fingerprint."""
-        return hmac.new(bytes.fromhex(self.naming_secret), fingerprint, hashlib.sha256).hexdigest()
+        return _mac(self.secret, b"name", fingerprint).hex()
+
+    def seal(self, content: bytes) -> bytes:
+        """Return the seal (HMAC-SHA256, SEAL_BYTES) of a content."""
+        return _seal(self.secret, content)
+
+    def sealed(self, content: bytes) -> bytes:
+        """Return content with the seal behind it, which `tar` ignores."""
+        return content + self.seal(content)
+
+    @property
+    def line(self) -> str:
+        """Line for the file of each secret key, a comment for age; `key_in` reads it."""
+        return f"{_line_begin(self.header)}{self.secret}"
 
 
 def key_for_recipients(recipients: Sequence[str]) -> BackupKey:
     """Return a new key for holders of secret keys elsewhere; BackupKeyWrong if one is no public key of age."""
     try:
-        return _new_key(BackupHeader(id=_new_id(), recipients=tuple(recipients)))
+        return BackupKey(header=BackupHeader(id=_new_id(), recipients=tuple(recipients)), secret=_new_secret())
     except ValueError as error:
         listed = ", ".join(recipients)
         raise BackupKeyWrong(f"no public keys of age: {listed:.200}", "Give a key that begins with age1.") from error
@@ -130,9 +157,10 @@ def key_for_passphrase(passphrase: str) -> BackupKey:
     """
     if len(passphrase) < MIN_PASSPHRASE:
         raise BackupKeyWrong("the passphrase is too short", f"Use {MIN_PASSPHRASE} characters or more.")
-    identity = pyrage.x25519.Identity.generate()
-    sealed = base64.b64encode(pyrage.passphrase.encrypt(str(identity).encode(), passphrase)).decode()
-    return _new_key(BackupHeader(id=_new_id(), recipients=(str(identity.to_public()),), sealed_identity=sealed))
+    identity, secret = pyrage.x25519.Identity.generate(), _new_secret()
+    sealed = base64.b64encode(pyrage.passphrase.encrypt(f"{identity}\n{secret}".encode(), passphrase)).decode()
+    header = BackupHeader(id=_new_id(), recipients=(str(identity.to_public()),), sealed_identity=sealed)
+    return BackupKey(header=header, secret=secret)
 
 
 def read_key(store: Path) -> BackupKey | None:
@@ -174,24 +202,47 @@ def key_of_passphrase(header: BackupHeader, passphrase: str) -> SecretKey:
         content = pyrage.passphrase.decrypt(base64.b64decode(header.sealed_identity), passphrase)
     except (pyrage.DecryptError, ValueError) as error:
         raise BackupKeyWrong("the passphrase is not that of these backups") from error
-    return SecretKey(content.decode())
+    identity, _, secret = content.decode().partition("\n")
+    return SecretKey(identity, secret)
 
 
-def key_in(path: Path) -> SecretKey:
-    """Return the secret key in a file of `age-keygen`; BackupKeyWrong if it has none."""
+def key_in(path: Path, header: BackupHeader) -> SecretKey:
+    """Return the secret key in a file of `age-keygen` with the `BackupKey.line` of these backups.
+
+    BackupKeyWrong if one of the two is missing.
+    """
     try:
         lines = read_text(path).splitlines()
     except SpecError as error:
         raise BackupKeyWrong(error.message, error.remedy) from error
-    for line in lines:
-        if line.startswith("AGE-SECRET-KEY-"):
-            return SecretKey(line)
-    raise BackupKeyWrong(f"{path} has no secret key of age")
+    identities = [line for line in lines if line.startswith("AGE-SECRET-KEY-")]
+    if not identities:
+        raise BackupKeyWrong(f"{path} has no secret key of age")
+    begin = _line_begin(header)
+    secrets_of_seals = [line.removeprefix(begin) for line in lines if line.startswith(begin)]
+    if not secrets_of_seals:
+        raise BackupKeyWrong(
+            f"{path} has no line that begins with {begin.strip()!r}",
+            "Add the line that the first of these backups printed: without it a forged backup looks like a true one.",
+        )
+    return SecretKey(identities[0], secrets_of_seals[0])
 
 
 def _new_id() -> str:
     return secrets.token_hex(4)
 
 
-def _new_key(header: BackupHeader) -> BackupKey:
-    return BackupKey(header=header, naming_secret=secrets.token_hex(32))
+def _new_secret() -> str:
+    return secrets.token_hex(32)
+
+
+def _line_begin(header: BackupHeader) -> str:
+    return f"# diffuscope backups {header.id} "
+
+
+def _seal(secret: str, content: bytes) -> bytes:
+    return _mac(secret, b"seal", content)
+
+
+def _mac(secret: str, use: bytes, content: bytes) -> bytes:
+    return hmac.new(secret.encode(), use + content, hashlib.sha256).digest()

@@ -10,7 +10,8 @@ import typer
 from device.clock import SystemClock
 from device.errors import SpecError
 from device.user_files import read_text
-from services.records.store_command import Data, app, table
+from services.backup.store_command import Data, app, table
+from services.identity.audit_key import find_audit_key
 from services.running_time import announcing, say
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ def backup(
     """Back up everything that is stored, encrypted, also while the instrument runs; later backups add what is new.
 
     The first backup asks for a passphrase, or takes --recipient. A restoration needs the passphrase, or the secret key
-    of one recipient. With --new-key, --recipient or --passphrase-file a new, complete series of backups begins.
+    of one recipient with the line that this command prints. With --new-key, --recipient or --passphrase-file a new,
+    complete series of backups begins.
     """
     from services.backup.backup_key import read_key  # deferred: imports SQLAlchemy
     from services.backup.write_backup import write_backup
@@ -78,8 +80,9 @@ def restore(
             say(f"Backup {damaged} is damaged; an older one is restored.")
         for unit in found.damaged_units:
             say(f"Damaged in the backup, not restored: {unit}")
-        CaptureStore(data).close()  # migrates the tables; where a record file is newer than its row, restores the row
-        results = check_store(data, lambda line: say(f"{line} ..."))
+        key = find_audit_key(data)  # that of the restored store
+        CaptureStore(data, key=key).close()  # migrates the tables; restores a row that is older than its file
+        results = check_store(data, lambda line: say(f"{line} ..."), key)
     typer.echo(table(results))
     typer.echo(f"Backup {found.number} of {found.made_at:%Y-%m-%d %H:%M} UTC is restored in {data}.")
     if found.damaged_units or found.damaged_backups or not all(result.is_whole for result in results):
@@ -90,7 +93,9 @@ def _new_key(recipients: list[str], passphrase_file: Path | None) -> "BackupKey"
     from services.backup.backup_key import key_for_passphrase, key_for_recipients
 
     if recipients:
-        return key_for_recipients(recipients)
+        key = key_for_recipients(recipients)
+        typer.echo(f"Add this line to the file of each secret key. A restoration needs both:\n{key.line}", err=True)
+        return key
     if passphrase_file is not None:
         return key_for_passphrase(_first_line(passphrase_file))
     typer.echo("Only this passphrase restores the backups. Write it down, and keep it away from the stick.", err=True)
@@ -101,7 +106,7 @@ def _secret_key(header: "BackupHeader", identity: Path | None, passphrase_file: 
     from services.backup.backup_key import key_in, key_of_passphrase
 
     if identity is not None:
-        return key_in(identity)
+        return key_in(identity, header)
     if passphrase_file is not None or not header.sealed_identity:
         return key_of_passphrase(header, _first_line(passphrase_file) if passphrase_file else "")
     return key_of_passphrase(header, typer.prompt("Passphrase of the backups", hide_input=True))

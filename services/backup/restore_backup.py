@@ -2,8 +2,8 @@
 
 import logging
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -51,8 +51,8 @@ def restore_backup(
 ) -> Restored:
     """Restore the newest readable backup in a folder of backups, or that with `number`, into an unused store.
 
-    Every unit is checked against its SHA-256 and age's authentication; one that is missing, unreadable or changed is
-    left out and named. A dose that the device has counted is never lowered. Until the last step nothing in the store
+    A backup needs the seal of its device, and every unit the SHA-256 in it; one that is missing, unreadable or changed
+    is left out and named. A dose that the device has counted is never lowered. Until the last step nothing in the store
     changes; what a power cut interrupts after it, the next opening or restoration completes. Errors: RestoreRefused
     (the store has records), BackupKeyWrong, BackupDamaged (no backup can be read), UsbDriveUnavailable, StoreFull,
     StoreError (the instrument is running, the disk refuses, or store or backup are of a version before the first
@@ -86,7 +86,9 @@ def _write_units(part: Path, folder: Path, manifest: Manifest, key: SecretKey, p
     for done, (unit, sha256) in enumerate(manifest.units.items()):
         progress(done, len(manifest.units))
         try:
-            _write_files(part, _decrypted(Path(unit), read_object(folder, sha256), key))
+            with _naming(Path(unit)):
+                content = key.decrypted(read_object(folder, sha256))
+            _write_files(part, content)
         except BackupDamaged as error:
             log.error("%s is not restored: %s", unit, error.message)
             damaged.append(unit)
@@ -118,24 +120,30 @@ def _newest_readable(folder: Path, key: SecretKey, number: int | None) -> tuple[
     for candidate in wanted:
         try:
             path = backup_path(folder, candidate)
-            archive = _decrypted(path, read_backup_file(folder, path), key)
-            return _manifest(archive), archive, tuple(damaged)
+            with _naming(path):
+                archive = key.opened(read_backup_file(folder, path))
+            return _manifest(archive, candidate), archive, tuple(damaged)
         except BackupDamaged as error:
             log.error("backup %s cannot be used: %s", candidate, error.message)
             damaged.append(candidate)
     raise BackupDamaged(f"no backup in {folder} can be read with this key")
 
 
-def _manifest(archive: bytes) -> Manifest:
+def _manifest(archive: bytes, number: int) -> Manifest:
     path, content = next(store_contents.unpacked(archive))
     if str(path) != MANIFEST:
         raise BackupDamaged("the archive of the backup has no list of its content")
-    return Manifest.model_validate_json(content)
+    manifest = Manifest.model_validate_json(content)
+    if manifest.number != number:
+        raise BackupDamaged(f"it is a copy of backup {manifest.number}")
+    return manifest
 
 
-def _decrypted(path: Path, encrypted: bytes, key: SecretKey) -> bytes:
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Add the name of a file to a BackupDamaged of the block."""
     try:
-        return key.decrypted(encrypted)
+        yield
     except BackupDamaged as error:
         raise BackupDamaged(f"{path.name}: {error.message}") from error
 

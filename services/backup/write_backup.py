@@ -51,7 +51,7 @@ def write_backup(
             raise BackupKeyWrong("no passphrase and no key is set for backups", "Choose a passphrase first.")
         if new_key is not None:
             write_key(store, new_key)
-        target = BackupFolder(place, key.header)
+        target = BackupFolder(place, key)
         for sha256 in target.forget_damaged(progress) if verify else ():
             log.warning("the object %s of the backup has changed; it is written again", sha256)
         for _ in range(ATTEMPTS):
@@ -94,7 +94,7 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     rest = store_contents.rest_of_store(store) | {schema.DATABASE: database}  # the copy, not the file in use
     manifest = Manifest(number=number, made_at=made_at, units=objects)
     content = store_contents.packed({MANIFEST: manifest.model_dump_json().encode(), **rest})
-    encrypted = key.header.encrypted(content)
+    encrypted = key.header.encrypted(key.sealed(content))
     target.add_backup(number, encrypted)
     progress(len(paths), len(paths))
     return LastBackup(

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from threading import Lock
 from typing import Protocol
 
@@ -15,6 +16,7 @@ from device.clock import Clock
 from device.errors import DiffuscopeError, StoreError, StoreReadOnly
 from services.health import alerts
 from services.health.alerts import Alert, AlertCode, CoolingTimer
+from services.health.clock_request import needs_time
 from services.health.clock_source import clock_state
 from services.health.instrument_status import InstrumentStatus
 from services.periodic_worker import PeriodicWorker
@@ -39,7 +41,7 @@ class AlertSources:
     """What the alerts are read from; `upload_queue` is None if no receiver is set up.
 
     `read_status` returns the status of the instrument; `lease_holder` the public name of the screen that holds the
-    control lease, None if no screen holds it.
+    control lease, None if no screen holds it. `system`: root of the file system.
     """
 
     read_status: Callable[[], InstrumentStatus]
@@ -47,6 +49,7 @@ class AlertSources:
     visits: VisitRepository
     lease_holder: Callable[[], str | None]
     upload_queue: UploadQueue | None = None
+    system: Path = Path("/")
 
 
 class AlertMonitor:
@@ -121,7 +124,8 @@ class AlertMonitor:
         now = self._clock.wall()
         now_s = self._clock.now_s()
         drift_s = (now - self._began[0]).total_seconds() - (now_s - self._began[1])
-        return alerts.date_alerts(now, self._newest(), drift_s, clock_state() in ("network", "browser"))
+        is_synchronised = clock_state(self._sources.system) in ("network", "browser")
+        return alerts.date_alerts(now, self._newest(), drift_s, is_synchronised, needs_time(self._sources.system))
 
     def _newest(self) -> datetime | None:
         """Return the time of the newest capture; None without one, or if the store cannot be read."""

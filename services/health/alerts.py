@@ -21,6 +21,7 @@ AlertCode = Literal[
     "batt.empty",
     "batt.low",
     "cal.old",
+    "clock.unset",
     "clock.wrong",
     "make.slow",
     "eye.side",
@@ -108,12 +109,18 @@ def is_age_warning(finding: Finding) -> bool:
     return finding.name == "age" and finding.hint and finding.limit > 0
 
 
-def date_alerts(now: datetime, newest: datetime | None, drift_s: float, is_synchronised: bool) -> Iterator[Alert]:
-    """Return the alert `clock.wrong` if the date is impossible or has jumped.
+def date_alerts(
+    now: datetime, newest: datetime | None, drift_s: float, is_synchronised: bool, needs_time: bool = False
+) -> Iterator[Alert]:
+    """Return the alert `clock.unset` for a clock that needs a tablet's time, or `clock.wrong` for a wrong date.
 
+    A wrong date is impossible or has jumped.
     Impossible: `thresholds.is_date_wrong`, with the time of the newest capture. Jumped:
     `thresholds.has_clock_jumped` since the start of the process, unless the network has set the clock.
     """
+    if needs_time:
+        yield Alert("clock.unset")
+        return
     has_jumped = thresholds.has_clock_jumped(drift_s) and not is_synchronised
     if thresholds.is_date_wrong(now, newest) or has_jumped:
         yield Alert("clock.wrong", date=now.astimezone().date().isoformat())

@@ -251,7 +251,7 @@ def clock(facts: StatusSnapshot) -> Check:
 CLOCK_WORDS: dict[ClockState, str] = {
     "network": "set by the network",
     "rtc": "kept by the clock of the board",
-    "browser": "set by a tablet",
+    "browser": "set by a tablet, not verified",
     "not_set": "time not set",
 }
 

@@ -11,6 +11,7 @@ from starlette.requests import HTTPConnection, Request
 
 from services.errors import AccessDenied, LoginRequired, SetupRequired
 from services.http.authentication import Authenticator, Peer
+from services.http.rate_limits import RateLimits
 from services.http.security import SAFE_METHODS
 from services.identity.users import ROLES, Role, User
 
@@ -65,6 +66,8 @@ ACCESS: dict[str, Access] = {
     "GET /api/status": MONITORED,
     "GET /api/health": MONITORED,
     "GET /api/programme": ANY_USER,
+    "POST /api/clock": ANY_USER,
+    "POST /api/clock/back": USERS,
     "GET /api/events": ANY_USER,
     "POST /api/controller": SCREEN,
     "GET /api/preview": LIGHT,
@@ -77,6 +80,7 @@ ACCESS: dict[str, Access] = {
     "GET /api/visits": READ,
     "POST /api/visits": EXAM,
     "GET /api/visits/{id}": READ,
+    "GET /api/visits/{id}/changes": READ,
     "PATCH /api/visits/{id}": EXAM,
     "POST /api/visits/{id}/slots": EXAM,
     "POST /api/visits/{id}/not-possible": EXAM,
@@ -119,12 +123,12 @@ ACCESS: dict[str, Access] = {
 }
 
 
-def access_required(authenticator: Authenticator) -> Callable[[Request], Awaitable[None]]:
+def access_required(authenticator: Authenticator, rates: RateLimits) -> Callable[[Request], Awaitable[None]]:
     """Return the dependency of every endpoint: it admits the user of a request by `ACCESS`, or raises.
 
     It leaves in `request.state` the `user` (None for a request without a login), `operation` and `audit_address` for
     the audit trail, and `is_admitted`, which a stream asks again while it is open. LoginRequired, SetupRequired,
-    ConfirmationRequired or AccessDenied.
+    ConfirmationRequired or AccessDenied; TooManyRequests beyond the rate of an address, or of a user who is admitted.
     """
 
     async def admit(request: Request) -> None:
@@ -136,7 +140,8 @@ def access_required(authenticator: Authenticator) -> Callable[[Request], Awaitab
         acts = rule.is_use and request.method not in SAFE_METHODS
         request.state.operation, request.state.audit_address = operation, peer.address
         request.state.user = None
-        request.state.user = _admitted(authenticator, rule, token, peer, acts)
+        request.state.user = user = _admitted(authenticator, rule, token, peer, acts)
+        rates.count(operation, peer.address if user is None else user.name)
         request.state.is_admitted = lambda: _is_admitted(authenticator, rule, token, peer)
 
     return admit

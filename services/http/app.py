@@ -1,9 +1,10 @@
 """App factory: every endpoint, middleware and background worker of one head arbiter."""
 
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 
 from fastapi import APIRouter, Depends, FastAPI
 
@@ -20,9 +21,11 @@ from services.http.control_lease import ControlLease
 from services.http.dependencies import acquire_control_lease, acquire_lease_for_light
 from services.http.openapi import DocumentedApp
 from services.http.problem_responses import problem_response, register_error_handlers
+from services.http.rate_limits import RATES, Rate, RateLimits
 from services.http.routes.audit import audit_router
 from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
+from services.http.routes.clock import clock_router
 from services.http.routes.events import event_router
 from services.http.routes.exports import exports_router
 from services.http.routes.login import login_router
@@ -74,14 +77,17 @@ def create_app(
     stream_limits: ClientLimits = STREAM_LIMITS,
     preview_limits: ClientLimits = PREVIEW_LIMITS,
     audit_log: AuditLog | None = None,
+    rates: Mapping[str, Rate] = RATES,
+    system: Path = Path("/"),
 ) -> Application:
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
-    `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
-    name of this computer. `programme` None loads the default programme. `technician_routers` are those of the
+    `host_names` are the host names that the server accepts, beside localhost and the address of the connection; None:
+    those of this computer. `programme` None loads the default programme. `technician_routers` are those of the
     technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
-    `audit_log`: None keeps none.
+    `audit_log`: None keeps none. `rates`: limits of operations in time. `system`: root of the file system, from which
+    the source of the clock is read.
     """
     store = arbiter.context.store
     clock = arbiter.context.clock
@@ -90,12 +96,14 @@ def create_app(
     queue = UploadQueue(store.engine, clock)
     pack = archive_builder(store, visits)
     worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
-    alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue)
+    alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue, system)
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.owner.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle, arbiter.context.spec.px_per_deg)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
-    app = _http_application(life, authenticator, own_host_names() if host_names is None else host_names)
-    app.add_middleware(AuditTrail, audit_log=audit_log, clock=clock)
+    app = _http_application(
+        life, authenticator, own_host_names() if host_names is None else host_names, RateLimits(rates, clock)
+    )
+    app.add_middleware(AuditTrail, audit_log=audit_log, clock=clock, system=system)
     pending = PendingCaptures()
     controlled = [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
@@ -111,6 +119,7 @@ def create_app(
     app.include_router(login_router(authenticator))
     app.include_router(users_router(authenticator.users))
     app.include_router(audit_router(audit_log))
+    app.include_router(clock_router(clock, system))
     app.include_router(calibration_router(arbiter))
     for router in (*technician_routers, removal_routes(PictureRemoval(store, visits, clock))):
         app.include_router(router)
@@ -119,18 +128,20 @@ def create_app(
 
 
 def _alert_monitor(
-    arbiter: HeadArbiter, visits: VisitRepository, lease: ControlLease, queue: UploadQueue | None
+    arbiter: HeadArbiter, visits: VisitRepository, lease: ControlLease, queue: UploadQueue | None, system: Path
 ) -> AlertMonitor:
     """Return the monitor of the alerts of an application; `queue` None: nothing is uploaded."""
     context = arbiter.context
-    sources = AlertSources(lambda: read_status(arbiter), context.store, visits, lambda: lease.holder, queue)
+    sources = AlertSources(lambda: read_status(arbiter), context.store, visits, lambda: lease.holder, queue, system)
     return AlertMonitor(sources, context.clock, context.event_bus.publish)
 
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 
 
-def _http_application(lifespan: Lifespan, authenticator: Authenticator, host_names: tuple[str, ...]) -> FastAPI:
+def _http_application(
+    lifespan: Lifespan, authenticator: Authenticator, host_names: tuple[str, ...], rates: RateLimits
+) -> FastAPI:
     """Return a FastAPI application with access control, problem responses and middlewares, the last one outermost."""
     app = DocumentedApp(
         title="Diffuscope",
@@ -139,7 +150,7 @@ def _http_application(lifespan: Lifespan, authenticator: Authenticator, host_nam
         openapi_url="/api/openapi.json",
         docs_url=None,
         redoc_url=None,
-        dependencies=[Depends(access_required(authenticator))],
+        dependencies=[Depends(access_required(authenticator, rates))],
         responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
     )
     register_error_handlers(app)

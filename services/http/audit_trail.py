@@ -2,18 +2,22 @@
 
 import logging
 from collections.abc import Callable
+from pathlib import Path
 
 from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from device.clock import Clock
 from device.errors import DiffuscopeError
+from services.health.clock_source import clock_state
 from services.records.audit_log import AuditLog
 
 log = logging.getLogger(__name__)
 
 VIEW = "view"
-VIEW_AGAIN_S = 300.0  # a page reads what it shows again and again: one entry for each user and record in this time
+# A page reads what it shows again and again: one entry for each user and record in this time. And a stranger, who asks
+# without end, gets one for each address and action, since each entry is written with fsync.
+AGAIN_S = 300.0
 ACTIONS = {
     "POST /api/login": "sign-in",
     "DELETE /api/login": "sign-out",
@@ -23,8 +27,11 @@ ACTIONS = {
     "POST /api/users": "add-user",
     "PATCH /api/users/{name}": "change-user",
     "DELETE /api/users/{name}": "remove-user",
+    "POST /api/clock": "set-clock",
+    "POST /api/clock/back": "set-clock-back",
     "POST /api/visits": "begin-visit",
     "GET /api/visits/{id}": VIEW,
+    "GET /api/visits/{id}/changes": VIEW,
     "PATCH /api/visits/{id}": "answer",
     "POST /api/visits/{id}/slots": "choose-picture",
     "POST /api/visits/{id}/not-possible": "not-possible",
@@ -53,12 +60,14 @@ Append = Callable[..., None]
 class AuditTrail:
     """ASGI middleware that records the actions of `ACTIONS`, also refused ones, with user, record and HTTP status.
 
-    `audit_log` None records nothing. A log that cannot be written is reported in the event log; requests go on.
+    With the source of the clock (clock_source.py), since the time of an entry is as good as that. `audit_log` None
+    records nothing. `system`: root of the file system. A log that cannot be written is reported in the event log;
+    requests go on.
     """
 
-    def __init__(self, app: ASGIApp, audit_log: AuditLog | None, clock: Clock) -> None:
-        self.app, self._log, self._clock = app, audit_log, clock
-        self._viewed_s: dict[tuple[str, str], float] = {}
+    def __init__(self, app: ASGIApp, audit_log: AuditLog | None, clock: Clock, system: Path) -> None:
+        self.app, self._log, self._clock, self._system = app, audit_log, clock, system
+        self._recorded_s: dict[tuple[str, ...], float] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass one ASGI request to the application, and record its action before the answer begins."""
@@ -79,21 +88,23 @@ class AuditTrail:
         name = state.get("audit_user") or ("" if user is None else user.name)
         parameters = scope.get("path_params", {})
         record = str(parameters.get("id") or parameters.get("name") or state.get("audit_record", ""))
-        if action == VIEW and not self._is_new_view(name, record, status):
+        address = state.get("audit_address", "")
+        if not name and not self._is_new(address, action):
             return
-        more = {"status": str(status), "field": state.get("audit_field", ""), "from": state.get("audit_address", "")}
+        if action == VIEW and status < 400 and not self._is_new(name, record):
+            return
+        more = {"status": str(status), "field": state.get("audit_field", ""), "from": address}
+        more["clock"] = clock_state(self._system)
         try:
             await run_in_threadpool(self._log.append, name, action, record, **more)
         except (OSError, DiffuscopeError) as error:
             log.error("the audit log cannot be written: %s", error)
 
-    def _is_new_view(self, name: str, record: str, status: int) -> bool:
-        """Return whether a view of this record by this user is to be recorded: each refused one, else the first."""
-        if status >= 400:
-            return True
+    def _is_new(self, *what: str) -> bool:
+        """Return whether the same was not recorded within AGAIN_S."""
         now_s = self._clock.now_s()
-        self._viewed_s = {key: at_s for key, at_s in self._viewed_s.items() if now_s - at_s < VIEW_AGAIN_S}
-        is_new = (name, record) not in self._viewed_s
+        self._recorded_s = {key: at_s for key, at_s in self._recorded_s.items() if now_s - at_s < AGAIN_S}
+        is_new = what not in self._recorded_s
         if is_new:
-            self._viewed_s[name, record] = now_s
+            self._recorded_s[what] = now_s
         return is_new

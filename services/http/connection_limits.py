@@ -7,6 +7,7 @@ request; a connection whose request is being answered is never closed for anothe
 
 import asyncio
 import socket
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -63,6 +64,7 @@ class ConnectionTable:
         self.limits, self.clock = limits, clock
         self._counts = ClientCounts(limits.clients)
         self._open: set[Connection] = set()
+        self.handshakes: dict[object, Connection] = {}  # of TLS, by the address of the client
         # Connections that wait for bytes of their client, by locality of the client; the longest wait is the first.
         self._waiting: dict[bool, dict[Connection, None]] = {False: {}, True: {}}
 
@@ -108,6 +110,11 @@ class ConnectionTable:
             self._open.remove(connection)
             self._counts.remove(connection.remote_client)
 
+    def end_handshake(self, address: object) -> None:
+        """Remove the handshake of a client at this address and port, if there is one."""
+        if (handshake := self.handshakes.pop(address, None)) is not None:
+            self.remove(handshake)
+
     def drop_overdue(self) -> None:
         """Drop every connection whose time-out is over; to be called several times per second."""
         now_s = self.clock.now_s()
@@ -116,22 +123,55 @@ class ConnectionTable:
             overdue.drop()
 
 
+class HandshakeSocket(socket.socket):
+    """Accepted socket that is in the table of connections from its opening to the end of its TLS handshake.
+
+    uvicorn creates its HTTP connection after the handshake. The header time-out is that of the handshake too. It takes
+    over the file descriptor of `accepted`.
+    """
+
+    def __init__(self, accepted: socket.socket, address: Any, table: ConnectionTable) -> None:
+        super().__init__(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
+        self._table, self._address, self._opened_s = table, address, table.clock.now_s()
+        self.remote_client = Client.at(address[0])
+        table.handshakes[address] = self
+        table.add(self)
+
+    def is_sending(self) -> bool:
+        """Return False: a handshake is a few kilobytes."""
+        return False
+
+    def is_overdue(self, now_s: float) -> bool:
+        """Return whether the time-out of the handshake is over."""
+        return now_s - self._opened_s > self._table.limits.header_timeout_s
+
+    def drop(self) -> None:
+        """Shut the connection down; its transport reads the end and closes it."""
+        with suppress(OSError):  # the client has closed it
+            self.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Close the connection, and leave the table."""
+        self._table.end_handshake(self._address)
+        super().close()
+
+
 class LimitedListener(socket.socket):
     """Listening socket that closes connections of an address beyond its limit, before anything is allocated for them.
 
-    It takes over the file descriptor of `listener`.
+    It takes over the file descriptor of `listener`. `is_tls`: connections enter the table before their handshake.
     """
 
-    def __init__(self, listener: socket.socket, table: ConnectionTable) -> None:
+    def __init__(self, listener: socket.socket, table: ConnectionTable, is_tls: bool = False) -> None:
         super().__init__(listener.family, listener.type, listener.proto, fileno=listener.detach())
-        self._table = table
+        self._table, self._is_tls = table, is_tls
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept the next connection; BlockingIOError if none waits, or after REFUSALS refused ones."""
         for _ in range(REFUSALS):
             connection, address = super().accept()
             if not self._table.is_refused(Client.at(address[0])):
-                return connection, address
+                return HandshakeSocket(connection, address, self._table) if self._is_tls else connection, address
             connection.close()
         raise BlockingIOError
 
@@ -171,6 +211,7 @@ class LimitedProtocol(H11Protocol):
         """Enter the table; a client that acknowledges no byte for the send time-out is disconnected."""
         super().connection_made(cast(asyncio.Transport, transport))
         self._remote_client = Client.at(self.client[0] if self.client is not None else "")
+        self._table.end_handshake(transport.get_extra_info("peername"))
         timeout_ms = round(self._table.limits.send_timeout_s * 1000)
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, timeout_ms)
         self._table.add(self)

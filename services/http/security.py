@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from device.errors import DiffuscopeError, InputError
 from services.errors import CrossOriginRequest, UntrustedHost
+from services.identity.certificates import SHARED_HOST_NAME
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 LIGHT_EMITTING_PATHS = frozenset({"/api/preview"})
@@ -56,7 +57,7 @@ class CrossOriginProtection:
         headers = Headers(scope=scope)
         host = headers.get("host")
         origin = headers.get("origin")
-        if host is not None and not is_trusted_host(host, self.names):
+        if host is not None and not is_trusted_host(host, self.names, (scope.get("server") or ("",))[0]):
             return UntrustedHost(f"{host[:80]!r} is not a name of this camera")
         if scope["method"] not in SAFE_METHODS and origin is not None and _authority(origin) != (host or "").lower():
             return CrossOriginRequest(f"a page of {origin[:80]!r} asked for a change")
@@ -73,25 +74,34 @@ def _is_same_origin(headers: Headers) -> bool:
     return "x-controller" in headers if site is None else site in SAME_ORIGIN_SITES
 
 
-def is_trusted_host(host: str, names: frozenset[str]) -> bool:
-    """Return whether a Host header is valid and trusted: any IP address, localhost, *.local, or one of `names`."""
+def is_trusted_host(host: str, names: frozenset[str], address: str) -> bool:
+    """Return whether a Host header is valid and trusted: one of `names`, localhost, or the `address` of the connection.
+
+    A name that a foreign name server resolves to this computer is none of these (DNS rebinding).
+    """
     try:
         name = urlsplit(f"//{host}").hostname or ""
         urlsplit(f"//{host}").port  # noqa: B018  # ValueError for an invalid port
     except ValueError:
         return False
-    if name in names or name == "localhost" or name.endswith(".local"):
+    if name in names or name == "localhost":
         return True
     try:
-        ipaddress.ip_address(name)
+        called = ipaddress.ip_address(name)
+        return called.is_loopback or called == _unmapped(ipaddress.ip_address(address))
     except ValueError:
         return False
-    return True
+
+
+def _unmapped(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """Return the IPv4 address of a client that an IPv6 socket accepted, other addresses unchanged."""
+    return getattr(address, "ipv4_mapped", None) or address
 
 
 def own_host_names() -> tuple[str, ...]:
-    """Return the host name of this computer, as a tuple of one."""
-    return (socket.gethostname(),)
+    """Return the names of this computer: its host name, and those that avahi publishes."""
+    name = socket.gethostname()
+    return name, f"{name}.local", SHARED_HOST_NAME
 
 
 def _authority(origin: str) -> str:

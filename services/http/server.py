@@ -10,6 +10,7 @@ import signal
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -42,7 +43,7 @@ from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
 from services.identity.audit_key import load_or_create_audit_key
-from services.identity.users import FOLDER
+from services.identity.users import FOLDER, UserTable
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
 from services.instrument.allocator import return_freed_arrays
 from services.instrument.events import EventBus
@@ -54,8 +55,10 @@ from services.records.audit_log import AuditLog
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.earlier_stores import refuse_earlier_store
 from services.records.programme import Programme
 from services.records.read_only_store import opened_store
+from services.records.schema import DATABASE
 from services.records.visit_repository import VisitRepository
 
 log = logging.getLogger(__name__)
@@ -63,7 +66,19 @@ log = logging.getLogger(__name__)
 ACCEPTS = 16  # connections accepted between two steps of the event loop
 LISTEN_QUEUE = 2048  # connections in the kernel until they are accepted; beyond it, a client tries again after 1 s
 SD_LISTEN_FD = 3  # the file descriptor of sd_listen_fds(3)
+CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # of TLS 1.2; those of 1.3 are all good
+CERTIFICATE_REMEDY = (
+    "Give PEM files that belong together: the certificate with its chain, and its key without a passphrase."
+)
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """PEM files of TLS: certificate with its chain, and its private key."""
+
+    chain: Path
+    key: Path
 
 
 def bind_socket(host: str, port: int) -> socket.socket:
@@ -86,9 +101,22 @@ def bind_socket(host: str, port: int) -> socket.socket:
     return listener
 
 
-def base_url(host: str, port: int) -> str:
+def base_url(host: str, port: int, is_tls: bool = False) -> str:
     """Return the URL of a page at a host name or an address; an IPv6 address stands in brackets (RFC 3986)."""
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    return f"{'https' if is_tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def require_protection(address: socket.socket, users: UserTable, certificate: Certificate | None) -> None:
+    """Raise InputError for a socket beyond this computer without a user, or without a certificate for TLS."""
+    host = str(address.getsockname()[0])
+    if Client.at(host).is_local or (users.has_begun and certificate is not None):
+        return
+    missing = "there is no certificate for TLS" if users.has_begun else "no user exists yet"
+    raise InputError(
+        f"{host} is open to the network, and {missing}",
+        "Create the first administrator with `diffuscope users add`, and give --certificate and --certificate-key. "
+        "Or serve on 127.0.0.1, and reach it with `ssh -L 8000:127.0.0.1:8000 THIS-COMPUTER`.",
+    )
 
 
 def inherited_socket(environment: Mapping[str, str]) -> socket.socket | None:
@@ -119,18 +147,22 @@ def serve(
     host_names: tuple[str, ...] = (),
     updater: tuple[Path | None, Path | None] = (None, None),
     uploader: Uploader | None = None,
+    certificate: Certificate | None = None,
 ) -> None:
     """Open the store and the head, call `ready`, and serve at `address` until SIGTERM, SIGINT or a failure.
 
     The page is available while the exam still plans its FFTs; an error that stopped the server is raised at the end.
     `data`: data folder. `ready` takes whether the page asks for the set-up code of the first user. `host_names`:
-    accepted host names beside the own and local ones. `measure`: the frontier measurement of this device. `updater`:
-    the updater's state folder and its request folder. `uploader`: uploads to the receiver. Everything that was opened
-    is closed at every exit. SystemExit(0) for a signal before the server runs.
+    accepted host names beside the own ones. `measure`: the frontier measurement of this device. `updater`:
+    the updater's state folder and its request folder. `uploader`: uploads to the receiver. `certificate`: of TLS, None
+    for plain HTTP. Everything that was opened is closed at every exit. InputError for an address beyond this computer
+    without users and TLS, SystemExit(0) for a signal before the server runs.
     """
     return_freed_arrays()
     clock = SystemClock()
-    with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
+    key = _audit_key(data)
+    with _Stop() as stop, address, opened_store(data, clock, key) as store, ExitStack() as undo, _limited_logs(clock):
+        require_protection(address, UserTable(data / FOLDER), certificate)
         data = store.folder  # of a read-only store: its copy in memory
         programme = _with_own_numbers(programme, store)
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
@@ -157,23 +189,37 @@ def serve(
             own_host_names() + host_names,
             technician_routers=routers,
             uploader=uploader,
-            audit_log=_audit_log(store, clock),
+            audit_log=_audit_log(store, key, clock),
         )
         _log_start(app.http.version, store)
+        server = _limited_server(app.http, clock, context.event_bus, certificate)
         ready(not authenticator.users.has_begun and authenticator.user(None, OWN_SCREEN) is None)
-        stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
+        stop.register(server).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
 
 
-def _audit_log(store: CaptureStore, clock: Clock) -> AuditLog | None:
-    """Return the audit log of a store, None without a key that can be read or on a disk that takes no changes."""
-    if store.refusal is not None:
-        return None
+def _audit_key(data: Path) -> bytes | None:
+    """Return the key of a data folder, made at the first start; None, and a line in the log, if it cannot be read.
+
+    StoreError for a folder of a version before the first release, in which nothing is written.
+    """
+    refuse_earlier_store(data / DATABASE)
     try:
-        audit_log = AuditLog(store.folder, load_or_create_audit_key(store.folder), clock)
-        audit_log.append("", "start", version=version("diffuscope"))
+        return load_or_create_audit_key(data)
     except (OSError, StoreDamaged) as error:
+        log.error("no audit log is kept, and no file of a record is authenticated: %s", error)
+        return None
+
+
+def _audit_log(store: CaptureStore, key: bytes | None, clock: Clock) -> AuditLog | None:
+    """Return the audit log of a store, None without a key or on a disk that takes no changes."""
+    if store.refusal is not None or key is None:
+        return None
+    audit_log = AuditLog(store.folder, key, clock)
+    try:
+        audit_log.append("", "start", version=version("diffuscope"))
+    except OSError as error:
         log.error("no audit log is kept: %s", error)
         return None
     return audit_log
@@ -194,9 +240,15 @@ def _with_own_numbers(programme: Programme, store: CaptureStore) -> Programme:
     return programme if device is None else programme.for_device(device.prefix)
 
 
-def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus) -> "Server":
+def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus, certificate: Certificate | None) -> "Server":
     table = ConnectionTable(ConnectionLimits(), clock)
-    return Server(LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1), event_bus)
+    tls = {} if certificate is None else {"ssl_certfile": certificate.chain, "ssl_keyfile": certificate.key}
+    config = LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1, ssl_ciphers=CIPHERS, **tls)
+    try:
+        config.load()
+    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
+        raise InputError(f"the certificate cannot be used: {error}", CERTIFICATE_REMEDY) from error
+    return Server(config, event_bus)
 
 
 def _log_start(version: str, store: CaptureStore) -> None:
@@ -296,7 +348,8 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to accept connections; asyncio sets the queue of the sockets to its number of accepts in a row."""
-        listeners = [LimitedListener(server_socket, self._connections) for server_socket in sockets or []]
+        is_tls = self.config.is_ssl
+        listeners = [LimitedListener(server_socket, self._connections, is_tls) for server_socket in sockets or []]
         await super().startup(list[socket.socket](listeners))
         for listener in listeners:
             listener.listen(LISTEN_QUEUE)

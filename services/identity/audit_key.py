@@ -1,4 +1,7 @@
-"""Key of the audit log: 32 random bytes beside the users, made once; records get it as a value."""
+"""Key of a data folder, 32 random bytes beside the users, made once; records get it as a value.
+
+It authenticates the audit log, the files of records and the second copy of the dose ledger.
+"""
 
 import secrets
 from pathlib import Path
@@ -26,10 +29,18 @@ def load_or_create_audit_key(data: Path) -> bytes:
 
 def read_audit_key(data: Path) -> bytes:
     """Return the key of a data folder; StoreDamaged for a key that is missing or of another length."""
+    key = find_audit_key(data)
+    if key is None:
+        raise StoreDamaged("the key of the audit log is missing", REMEDY)
+    return key
+
+
+def find_audit_key(data: Path) -> bytes | None:
+    """Return the key of a data folder, None if it has none; StoreDamaged for a key of another length."""
     try:
         key = (data / FOLDER / FILE).read_bytes()
-    except FileNotFoundError as error:
-        raise StoreDamaged("the key of the audit log is missing", REMEDY) from error
+    except FileNotFoundError:
+        return None
     if len(key) != BYTES:
         raise StoreDamaged("the key of the audit log is damaged", REMEDY)
     return key

@@ -78,10 +78,11 @@ class CaptureStore:
 
     `newly_quarantined` holds the names in `quarantine/` of the folders moved there at this opening, `recovery` what was
     restored from the files of the records. With `refusal` the folder is a copy in memory (read_only_store.py): nothing
-    is recovered or quarantined, and every change raises this error. `quarantine`, `versions`, `space` and
-    `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a lock
-    file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log. Errors at
-    opening: StoreError, StoreFull, StoreDamaged.
+    is recovered or quarantined, and every change raises this error. `key` authenticates the files of records and dose
+    ledger: nothing is restored from one that another program wrote; None checks none. `quarantine`, `versions`, `space`
+    and `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a
+    lock file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log.
+    Errors at opening: StoreError, StoreFull, StoreDamaged.
     """
 
     newly_quarantined: tuple[str, ...]
@@ -96,6 +97,7 @@ class CaptureStore:
         free_files: Callable[[Path], float] = atomic_io.free_files,
         clock: Clock | None = None,
         refusal: StoreError | None = None,
+        key: bytes | None = None,
     ) -> None:
         self.folder, self.refusal = folder, refusal
         self._captures = folder / "captures"
@@ -108,7 +110,7 @@ class CaptureStore:
             atomic_io.make_folder(self._captures)
             atomic_io.make_folder(quarantine)
             snapshots = Snapshots(database, clock or SystemClock(), free_bytes)
-            self.engine = schema.open_engine(database)  # connects later
+            self.engine = schema.open_engine(database, key)  # connects later
             cleanup.callback(self.engine.dispose)
             self.write_ahead_log = WriteAheadLog(database, self.engine)
             self.quarantine = Quarantine(self._captures, quarantine, self._lock, self.engine)
@@ -166,7 +168,7 @@ class CaptureStore:
         record = RecordDocument("capture", 1, capture_content(row, file_entries(row)))
         length_bytes = sum(map(_length_bytes, files.values()))  # rows and record, some kilobytes, fit into the reserve
         new_bytes = sum(len(content) for content in files.values() if isinstance(content, bytes))
-        files = {**files, CAPTURE_RECORD: record.encoded()}
+        files = {**files, CAPTURE_RECORD: record.encoded(schema.key_of(self.engine))}
         part = self._captures / f".{capture.id}.part"
         kept = self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):

@@ -1,12 +1,15 @@
 """Second copy of the dose ledger: an append-only file, so that lost or restored rows of the database lower no dose.
 
-    dose-ledger.log     one line per change: CRC-32 (8 hexadecimal digits), space, JSON of the whole ledger
+    dose-ledger.log     one line per change: CRC-32 (8 hexadecimal digits), space, JSON of the whole ledger and `mac`
 
-Each line holds the whole ledger, so the last line with a valid CRC is enough. Lines are appended without fsync, so that
+Each line holds the whole ledger, so the last valid line is enough. `mac` is an HMAC-SHA-256 with the key of the store:
+who changes a line can compute its CRC, but not that. Lines are appended without fsync, so that
 no exposure waits for it: only the database is durable across a power cut. A log of MAX_BYTES is replaced atomically by
 its last line.
 """
 
+import hashlib
+import hmac
 import json
 import zlib
 from pathlib import Path
@@ -23,22 +26,25 @@ MAX_BYTES = 262_144
 
 
 class DoseLedgerLog:
-    """Append-only copy of the dose ledger in the folder of the store; the caller serialises writers."""
+    """Append-only copy of the dose ledger in the folder of the store; the caller serialises writers.
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / LOG
+    `key`: of the store; None writes and checks no `mac`.
+    """
+
+    def __init__(self, folder: Path, key: bytes | None = None) -> None:
+        self._path, self._key = folder / LOG, key
 
     def newest(self) -> DoseLedgerState | None:
-        """Return the last ledger with a valid CRC; None if there is none."""
+        """Return the last ledger with a valid CRC and `mac`; None if there is none."""
         lines = self._path.read_bytes().splitlines() if self._path.exists() else []
         for line in reversed(lines):
-            if (state := _state_in(line)) is not None:
+            if (state := _state_in(line, self._key)) is not None:
                 return state
         return None
 
     def append(self, state: DoseLedgerState) -> None:
         """Append a ledger, without fsync; OSError if the disk refuses."""
-        line = _line(state)
+        line = _line(state, self._key)
         if self._path.exists() and self._path.stat().st_size + len(line) > MAX_BYTES:
             atomic_io.write_atomically(self._path, line)
             return
@@ -59,20 +65,33 @@ def raise_to(state: DoseLedgerState, other: DoseLedgerState) -> None:
         state.doses[key] = max(state.doses.get(key, 0.0), dose_j_per_cm2)
 
 
-def _line(state: DoseLedgerState) -> bytes:
+def _line(state: DoseLedgerState, key: bytes | None) -> bytes:
     """Return the line of a ledger, after a line break: a torn line before it stays a line of its own."""
-    doses = [[eye, interval, dose_j_per_cm2] for (eye, interval), dose_j_per_cm2 in state.doses.items()]
-    entry = {"boot": state.boot, "now_s": state.now_s, "observed_s": state.observed_s, "doses": doses}
+    doses: list[JsonValue] = [
+        [eye, interval, dose_j_per_cm2] for (eye, interval), dose_j_per_cm2 in state.doses.items()
+    ]
+    entry: dict[str, JsonValue] = {"boot": state.boot, "now_s": state.now_s, "observed_s": state.observed_s}
+    entry["doses"] = doses
+    if key is not None:
+        entry["mac"] = _mac(key, entry)
     content = json.dumps(entry, separators=(",", ":")).encode()
     return b"\n%08x %b\n" % (zlib.crc32(content), content)
 
 
-def _state_in(line: bytes) -> DoseLedgerState | None:
-    """Return the ledger in a line; None if the line is torn, or if its CRC does not match."""
+def _mac(key: bytes, entry: JsonObject) -> str:
+    return hmac.new(key, b"dose " + json.dumps(entry).encode(), hashlib.sha256).hexdigest()
+
+
+def _state_in(line: bytes, key: bytes | None) -> DoseLedgerState | None:
+    """Return the ledger in a line; None if the line is torn, or if its CRC or `mac` does not match."""
     crc, _, content = line.partition(b" ")
     if not content or crc != b"%08x" % zlib.crc32(content):
         return None
-    return _ledger(as_object(json.loads(content)))
+    entry = dict(as_object(json.loads(content)))
+    mac = str(entry.pop("mac", ""))
+    if key is not None and not hmac.compare_digest(_mac(key, entry), mac):
+        return None
+    return _ledger(entry)
 
 
 def _ledger(entry: JsonObject) -> DoseLedgerState:

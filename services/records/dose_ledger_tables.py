@@ -49,7 +49,7 @@ class DoseLedgerStore:
         self._engine, self._clock, self._window_s = engine, clock, window_s
         # With a random id the time between two openings does not count as observed, so doses expire later.
         self._boot = boot or boot_id()
-        self._log = DoseLedgerLog(schema.folder_of(engine))
+        self._log = DoseLedgerLog(schema.folder_of(engine), schema.key_of(engine))
         self._reserve = ReserveFile(schema.folder_of(engine))
         is_lost = self._is_lost()
         with self._writing() as state:

@@ -27,14 +27,14 @@ NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "accuracy"})
 
 
 @contextmanager
-def opened_store(folder: Path, clock: Clock) -> Iterator[CaptureStore]:
+def opened_store(folder: Path, clock: Clock, key: bytes | None = None) -> Iterator[CaptureStore]:
     """Open the store in a folder, and close it at exit; read-only if its disk takes no changes; a context manager.
 
-    On a full disk the reserve file is released first. Errors: those of `CaptureStore`, if the disk can be written or if
-    it cannot be read either.
+    `key`: as of `CaptureStore`. On a full disk the reserve file is released first. Errors: those of `CaptureStore`, if
+    the disk can be written or if it cannot be read either.
     """
     try:
-        store = _opened(folder, clock)
+        store = _opened(folder, clock, key)
     except (StoreFull, StoreReadOnly) as refusal:
         log.error("the store is opened for reading only: %s", refusal.message)
         with _copy_opened(folder, clock, refusal) as copy:
@@ -44,10 +44,10 @@ def opened_store(folder: Path, clock: Clock) -> Iterator[CaptureStore]:
         yield store
 
 
-def _opened(folder: Path, clock: Clock) -> CaptureStore:
+def _opened(folder: Path, clock: Clock, key: bytes | None) -> CaptureStore:
     """Open the store for reading and writing; on a full disk once more without the reserve file."""
     with storage_errors():
-        return ReserveFile(folder).retried(lambda: CaptureStore(folder, clock=clock))
+        return ReserveFile(folder).retried(lambda: CaptureStore(folder, clock=clock, key=key))
 
 
 @contextmanager

@@ -17,10 +17,10 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 class RecordFiles:
-    """Files of the records of the store in `folder`; the caller serialises writers."""
+    """Files of the records of the store in `folder`, authenticated by its key; the caller serialises writers."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, key: bytes | None = None) -> None:
+        self._folder, self._key = folder, key
 
     def exist(self) -> bool:
         """Return whether the folders of the files are here, so that the rows of visits can be rebuilt from them."""
@@ -49,7 +49,7 @@ class RecordFiles:
                 return None
             except OSError as error:
                 raise StoreDamaged(f"the record of {id} cannot be read: {error}") from error
-            document = parse_document(content)
+            document = parse_document(content, self._key)
             if (document.kind, document.id) != (kind, id):
                 raise ValueError(f"a record of the {document.kind} {document.id!r:.60}")
             return document
@@ -68,7 +68,7 @@ class RecordFiles:
         for document in documents:
             path = self.path(document.kind, document.id)
             if path.parent.is_dir():
-                atomic_io.write_atomically(path, document.encoded())
+                atomic_io.write_atomically(path, document.encoded(self._key))
 
     def write_all(self, documents: Iterable[RecordDocument]) -> None:
         """Write or replace the files of many records, durable on return by one sync instead of two for each file.
@@ -80,7 +80,7 @@ class RecordFiles:
         for document in documents:
             path = self.path(document.kind, document.id)
             if path.parent.is_dir():
-                atomic_io.write_atomically_unsynced(path, document.encoded())
+                atomic_io.write_atomically_unsynced(path, document.encoded(self._key))
                 written = True
         if written:
             os.sync()

@@ -19,11 +19,12 @@ from device.values import EYES
 from services.records import numbering, row_validation
 from services.records.capture import CaptureReport
 from services.records.json_values import JsonObject, JsonValue
-from services.records.record_document import Kind, as_object, whole_number
+from services.records.record_document import Kind, as_list, as_object, whole_number
 from services.records.schema import (
     AnswerRow,
     CaptureRow,
     CaptureSlotRow,
+    ChangeRow,
     FileRow,
     IdempotencyKeyRow,
     IdentifierRow,
@@ -88,6 +89,8 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
     answers = _grouped((row.visit, row.name, (row.value, row.set_at)) for row in answered if row is not None)
     decided = session.scalars(select(SlotDecisionRow).where(SlotDecisionRow.visit.in_(ids)))
     slots = _grouped((row.visit, row.slot, (row.capture, row.reason)) for row in decided if row is not None)
+    changed = session.scalars(select(ChangeRow).where(ChangeRow.visit.in_(ids)).order_by(ChangeRow.number))
+    changes = _grouped((row.visit, row.field, row) for row in changed if row is not None)
     sent = session.scalars(select(UploadRow).where(UploadRow.visit.in_(ids), UploadRow.sent_at.is_not(None)))
     uploads = _grouped((row.visit, row.finished_at, row) for row in sent if row is not None)
     numbers = row_validation.readable_keys(row.patient for row in rows)
@@ -95,7 +98,10 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
     patients: dict[str, str] = {row.number: row.patient_id for row in session.execute(query)}
 
     def content(row: VisitRow) -> Content:
-        return {
+        history: Content = {}
+        if changes[row.id]:
+            history["changes"] = [_change_content(change) for _, change in changes[row.id]]
+        return history | {
             "id": row.id,
             "patient_id": patients.get(row.patient),
             "number": row.patient,
@@ -150,7 +156,7 @@ def restore_visit(session: Session, content: JsonObject) -> bool:
 
     A patient without rows gets a row with that number and no identifying field. Errors as in `restore_patient`.
     """
-    row, answers, uploads, _ = _visit_rows(content)
+    row, answers, changes, uploads, _ = _visit_rows(content)
     described = row.patient
     patient_id = row_validation.text(content["patient_id"])
     row.patient = _free_number(session, described, patient_id)
@@ -158,11 +164,12 @@ def restore_visit(session: Session, content: JsonObject) -> bool:
         session.add(PatientRow(number=row.patient, made_at=row.begun_at, patient_id=patient_id))
         session.flush()
     session.execute(delete(AnswerRow).where(AnswerRow.visit == row.id))
+    session.execute(delete(ChangeRow).where(ChangeRow.visit == row.id))
     session.execute(delete(UploadRow).where(UploadRow.visit == row.id, UploadRow.sent_at.is_not(None)))
     _restore_request(session, row.request, row.id, row.begun_at)
     session.merge(row)
     session.flush()
-    session.add_all(answers)
+    session.add_all([*answers, *changes])
     for upload in uploads:
         session.merge(upload)
     session.flush()
@@ -174,7 +181,7 @@ def restore_decisions(session: Session, content: JsonObject) -> list[str]:
 
     A decision on such a capture is omitted: its files and its record are gone.
     """
-    row, _, _, decisions = _visit_rows(content)
+    row, _, _, _, decisions = _visit_rows(content)
     session.execute(delete(SlotDecisionRow).where(SlotDecisionRow.visit == row.id))
     chosen = {decision.capture for decision in decisions if decision.capture is not None}
     present = set(session.scalars(select(CaptureRow.id).where(CaptureRow.id.in_(chosen))))
@@ -255,7 +262,9 @@ def _patient_rows(content: JsonObject) -> tuple[PatientRow, list[IdentifierRow]]
     return row, [IdentifierRow(patient=number, name=name, value=json.dumps(value)) for name, value in values.items()]
 
 
-def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[UploadRow], list[SlotDecisionRow]]:
+def _visit_rows(
+    content: JsonObject,
+) -> tuple[VisitRow, list[AnswerRow], list[ChangeRow], list[UploadRow], list[SlotDecisionRow]]:
     """Return the rows that the content of a visit describes."""
     id = row_validation.text(content["id"])
     outcome = content["outcome"]
@@ -271,6 +280,7 @@ def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[Up
         request=request,
     )
     answers = [(row_validation.text(name), as_object(answer)) for name, answer in as_object(content["answers"]).items()]
+    changes = [_change_row(id, as_object(change)) for change in as_list(content.get("changes", []))]
     uploads = [_upload_row(id, at, as_object(upload)) for at, upload in as_object(content["uploads"]).items()]
     return (
         row,
@@ -280,6 +290,7 @@ def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[Up
             )
             for name, answer in answers
         ],
+        changes,
         uploads,
         [_decision_row(id, slot, as_object(decision)) for slot, decision in as_object(content["decisions"]).items()],
     )
@@ -288,6 +299,24 @@ def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[Up
 def _decision_row(visit: str, slot: str, decision: JsonObject) -> SlotDecisionRow:
     capture, reason = (_text_or_none(decision[name]) for name in ("capture", "reason"))
     return SlotDecisionRow(visit=visit, slot=row_validation.text(slot), capture=capture, reason=reason)
+
+
+def _change_content(row: ChangeRow) -> Content:
+    texts: Content = {"number": row.number, "at": row.at, "user": row.user, "field": row.field, "why": row.why}
+    return texts | {"was": _parsed(row.was), "value": _parsed(row.value)}
+
+
+def _change_row(visit: str, change: JsonObject) -> ChangeRow:
+    return ChangeRow(
+        visit=visit,
+        number=whole_number(change["number"]),
+        at=_moment(change["at"]),
+        user=row_validation.text(change["user"]),
+        field=row_validation.text(change["field"]),
+        was=json.dumps(change["was"]),
+        value=json.dumps(change["value"]),
+        why=_text_or_none(change["why"]),
+    )
 
 
 def _upload_content(row: UploadRow) -> Content:

@@ -40,7 +40,7 @@ def recorded(engine: Engine) -> Iterator[Session]:
     If the block or the commit fails, the files describe the rows as before. Errors: those of the block, of the disk and
     of SQLite, which `storage_errors` converts.
     """
-    files = RecordFiles(schema.folder_of(engine))
+    files = RecordFiles(schema.folder_of(engine), schema.key_of(engine))
     written = list[RecordDocument]()
     with Session(schema.for_writing(engine)) as session:
         try:

@@ -84,7 +84,7 @@ class Recovery:
     def __init__(self, folder: Path, engine: Engine, rebuilt_because: str | None) -> None:
         self._folder = folder
         self._engine = engine
-        self._files = RecordFiles(folder)
+        self._files = RecordFiles(folder, schema.key_of(engine))
         self.report = RecoveryReport(rebuilt_because=rebuilt_because)
         self._restored_visits: list[tuple[RecordDocument, bool]] = []
 

@@ -262,6 +262,29 @@ class AnswerRow(Base):
     )
 
 
+class ChangeRow(Base):
+    """One change of a visit, number 1 first: time (UTC), user ("" for the device), form field, `outcome`, `laterality`.
+
+    `was` and `value` (JSON): before and after; `why`: reason of a reopening, or null. Rows are only added.
+    """
+
+    __tablename__ = "changes"
+
+    visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    at: Mapped[str] = mapped_column(Text)
+    user: Mapped[str] = mapped_column(Text)
+    field: Mapped[str] = mapped_column(Text)
+    was: Mapped[str] = mapped_column(Text)
+    value: Mapped[str] = mapped_column(Text)
+    why: Mapped[str | None] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("json_valid(was) AND json_valid(value)", name="change_is_json"),
+        {"sqlite_strict": True},
+    )
+
+
 class CaptureSlotRow(Base):
     """Visit and picture slot of a capture; a test picture has no such row."""
 
@@ -360,12 +383,14 @@ def record_key(row: RecordRow) -> str:
     return row.number if isinstance(row, PatientRow) else row.id
 
 
-def open_engine(path: Path) -> Engine:
+def open_engine(path: Path, key: bytes | None = None) -> Engine:
     """Return an engine for one SQLite file, usable from any thread; transactions of `for_writing` are serialised.
+
+    `key`: authenticates the files beside the tables, see `key_of`.
 
     The driver's own transaction handling is off: its commit before each schema change would split a migration.
     """
-    engine = create_engine(URL.create("sqlite", database=str(path)))
+    engine = create_engine(URL.create("sqlite", database=str(path)), execution_options={"file_key": key})
     event.listen(engine, "connect", _prepare)
     event.listen(engine, "begin", _begin)
     return engine
@@ -381,6 +406,12 @@ def make_private(database: Path) -> None:
 def folder_of(engine: Engine) -> Path:
     """Return the folder of the store whose tables these are."""
     return Path(str(engine.url.database)).parent
+
+
+def key_of(engine: Engine) -> bytes | None:
+    """Return the key that authenticates the files of the store whose tables these are; None without one."""
+    key: bytes | None = engine.get_execution_options()["file_key"]
+    return key
 
 
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:

@@ -5,7 +5,7 @@ Nothing is changed, so the check may run beside the instrument. What is healable
 """
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,8 +42,10 @@ class Checked:
         return not self.healable and not self.damaged
 
 
-def check_store(folder: Path, progress: Progress) -> list[Checked]:
+def check_store(folder: Path, progress: Progress, key: bytes | None = None) -> list[Checked]:
     """Check the store in `folder` and return a result for each kind of content; `progress` gets one line per kind.
+
+    `key`: authenticates its files; None checks no authenticity.
 
     RecordNotFound if the folder holds no store; StoreError if the disk refuses, or for an earlier store.
     """
@@ -53,11 +55,13 @@ def check_store(folder: Path, progress: Progress) -> list[Checked]:
     with storage_errors():
         progress("reading the database")
         database = _checked_database(folder)
-        results = [database, _checked_ledger(folder)]
+        files = RecordFiles(folder, key)
+        results = [database, _checked_ledger(folder, key)]
         documents = dict[tuple[Kind, str], RecordDocument]()
         for kind, name in KINDS.items():
             progress(f"reading the {name}")
-            results.append(_checked_records(folder, kind, name, database.is_whole, documents))
+            rows = _records_in_rows(folder, kind) if database.is_whole else ()
+            results.append(_checked_records(folder, files, kind, rows, documents))
         progress("reading the files of the captures")
         results.append(_checked_files(folder, documents))
     return results
@@ -75,9 +79,9 @@ def _checked_database(folder: Path) -> Checked:
     return result
 
 
-def _checked_ledger(folder: Path) -> Checked:
+def _checked_ledger(folder: Path, key: bytes | None) -> Checked:
     result = Checked("copy of the dose ledger")
-    if DoseLedgerLog(folder).newest() is None:
+    if DoseLedgerLog(folder, key).newest() is None:
         result.healable.append("no valid entry")
     else:
         result.whole = 1
@@ -85,13 +89,16 @@ def _checked_ledger(folder: Path) -> Checked:
 
 
 def _checked_records(
-    folder: Path, kind: Kind, name: str, with_rows: bool, documents: dict[tuple[Kind, str], RecordDocument]
+    folder: Path,
+    files: RecordFiles,
+    kind: Kind,
+    rows: Iterable[tuple[str, RecordDocument | None]],
+    documents: dict[tuple[Kind, str], RecordDocument],
 ) -> Checked:
     """Compare rows and files of all records of a kind; add the newest whole state of each to `documents`."""
-    result = Checked(name)
-    files = RecordFiles(folder)
+    result = Checked(KINDS[kind])
     known = set[str]()
-    for id, in_rows in _records_in_rows(folder, kind) if with_rows else ():
+    for id, in_rows in rows:
         known.add(id)
         in_file = _in_file(files, kind, id)
         whole = [document for document in (in_rows, in_file) if document is not None]

@@ -13,6 +13,7 @@ from services.records.programme import VISIONS, Programme, Vision
 GREEN_ONLY = "colour.none"  # no other colour was asked for, or the head has none
 EYE_WORDS = {"OD": "right", "OS": "left"}
 URGENT_COMPLAINTS = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
+ReopenReason = Literal["answer", "picture", "mistake"]  # a wrong answer, a missing picture, finished by mistake
 OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "declined", "send"]
 
 

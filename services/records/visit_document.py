@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from services.records.capture import StoredVerdict
 from services.records.json_values import FormValue, Timestamp
-from services.records.visit import Outcome, SlotState, Visit
+from services.records.visit import Outcome, ReopenReason, SlotState, Visit
 
 
 class SlotDocument(BaseModel):
@@ -47,6 +47,24 @@ class VisitDocument(BaseModel):
     outcome: Outcome | None
     finished_at: Timestamp | None
     undo_until: Timestamp | None
+
+
+class VisitChange(BaseModel):
+    """One change of a visit: time by the device's clock, user ("" for the device), form field, `outcome`, `laterality`.
+
+    `was`, `value`: before and after; an outcome by its code, a laterality by its picture slot. `why`: reason of a
+    reopening, or null.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    number: int
+    at: Timestamp
+    user: str
+    field: str
+    was: FormValue
+    value: FormValue
+    why: ReopenReason | None
 
 
 def visit_document(visit: Visit, undo_until: datetime | None = None) -> VisitDocument:

@@ -143,12 +143,12 @@ class VisitPictures:
 
         return self._run(key, f"keep {capture}", act)
 
-    def correct_laterality(self, key: str, capture: str, eye: Eye, by: str | None) -> Visit:
+    def correct_laterality(self, key: str, capture: str, eye: Eye, by: str | None, user: str = "") -> Visit:
         """Correct the eye of a capture: move the capture to the slot of that eye with the same field of view.
 
         If the capture already has that eye, record the confirmation. `by`: public name of the screen that requested the
-        correction, or None. Errors: RecordNotFound (unknown capture or test picture), VisitFinished, InputError (the
-        programme has no such slot).
+        correction, or None; a move enters the history of the visit with `user`. Errors: RecordNotFound (unknown capture
+        or test picture), VisitFinished, InputError (the programme has no such slot).
         """
 
         def act(session: Session) -> str:
@@ -166,6 +166,8 @@ class VisitPictures:
                 visit_rows.decide(session, shot.visit, from_slot, None)
             verdict = next((taken.verdict for taken in before[from_slot].captures if taken.capture == capture), None)
             visit_rows.decide(session, shot.visit, to.id, decision_after(before[to.id], SlotCapture(capture, verdict)))
+            now = schema.utc_text(self._clock.wall())
+            visit_rows.record_change(session, shot.visit, "laterality", from_slot, to.id, now, user)
             laterality_correction.relabel(session, shot, to, self._clock.wall(), by)
             return shot.visit
 

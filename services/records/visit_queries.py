@@ -18,6 +18,7 @@ from device.values import ChannelUse
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import row_validation
 from services.records.capture import StoredVerdict
+from services.records.json_values import JsonValue
 from services.records.programme import Programme
 from services.records.record_rows import visit_contents
 from services.records.record_signing import refuse_changed
@@ -28,12 +29,14 @@ from services.records.schema import (
     AnswerRow,
     CaptureRow,
     CaptureSlotRow,
+    ChangeRow,
     IdentifierRow,
     SlotDecisionRow,
     VisitRow,
     json_extract_or_null,
 )
 from services.records.visit import Outcome, OutcomeCode, SlotCapture, SlotDecision, SlotState, Visit, no_colour_of
+from services.records.visit_document import VisitChange
 
 PAGE_ROWS = 500  # visits per query where all visits are read
 _CHANNELS = TypeAdapter(tuple[ChannelUse, ...])
@@ -57,10 +60,37 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
     RecordNotFound if the visit is unknown, StoreDamaged if the answer cannot be read.
     """
     patient = visit_row(session, id).patient
-    answer = session.get(AnswerRow, (id, "consent"))
+    value = answer(session, id, "consent")
     with reading_record(id):
-        value = None if answer is None else row_validation.parsed_json(answer.value)
         return patient, None if value is None else row_validation.text(value)
+
+
+def answer(session: Session, id: str, name: str) -> JsonValue:
+    """Return the answer of a visit to a form field, None without one; StoreDamaged if it cannot be read."""
+    row = session.get(AnswerRow, (id, name))
+    with reading_record(id):
+        return None if row is None else row_validation.parsed_json(row.value)
+
+
+def changes(session: Session, programme: Programme, row: VisitRow) -> list[VisitChange]:
+    """Return the history of a visit, the first change first; StoreDamaged if the visit cannot be read."""
+    read_visit(session, programme, row)
+    query = select(ChangeRow).where(ChangeRow.visit == row.id).order_by(ChangeRow.number)
+    with reading_record(row.id):
+        return [
+            VisitChange.model_validate(
+                {
+                    "number": change.number,
+                    "at": row_validation.timestamp(change.at),
+                    "user": change.user,
+                    "field": change.field,
+                    "was": row_validation.parsed_json(change.was),
+                    "value": row_validation.parsed_json(change.value),
+                    "why": change.why,
+                }
+            )
+            for change in session.scalars(query)
+        ]
 
 
 def find_rows(session: Session, limit: int, day: str | None, open: bool | None, number: str | None) -> list[VisitRow]:

@@ -14,7 +14,8 @@ from services.records.idempotent_requests import IdempotentRequests
 from services.records.programme import Programme
 from services.records.schema import AnswerRow, IdentifierRow, VisitRow
 from services.records.storage_errors import storage_errors
-from services.records.visit import Visit
+from services.records.visit import ReopenReason, Visit
+from services.records.visit_document import VisitChange
 from services.records.visit_pictures import VisitPictures
 
 
@@ -87,11 +88,16 @@ class VisitRepository:
         with storage_errors(), Session(self._engine) as session:
             return visit_queries.counts(session, day)
 
-    def answer(self, key: str, id: str, name: str, value: object) -> Visit:
+    def changes(self, id: str) -> list[VisitChange]:
+        """Return the history of a visit, the first change first; errors as in `get`."""
+        with storage_errors(), Session(self._engine) as session:
+            return visit_queries.changes(session, self.programme, visit_queries.visit_row(session, id))
+
+    def answer(self, key: str, id: str, name: str, value: object, user: str = "") -> Visit:
         """Store the answer to the form field `name` of a visit; None is stored as no answer.
 
-        Identifying fields belong to the patient, so all visits of the patient show them; None deletes the field, and no
-        history is kept.
+        `user` and the value before enter the history of the visit. Identifying fields belong to the patient, so all
+        visits of the patient show them; None deletes the field, and no history is kept.
         Errors: InputError (unknown field, invalid answer), VisitFinished, RecordNotFound (unknown visit).
         """
         value = answers.validate_answer(name, value)
@@ -100,6 +106,8 @@ class VisitRepository:
             patient = visit_rows.unfinished_row(session, id).patient
             now = schema.utc_text(self.clock.wall())
             if name not in answers.IDENTIFIERS:  # null is an answer too: no drops were given
+                was = visit_queries.answer(session, id, name)
+                visit_rows.record_change(session, id, name, was, value, now, user)
                 session.merge(AnswerRow(visit=id, name=name, value=json.dumps(value), set_at=now))
             elif value is not None:
                 session.merge(IdentifierRow(patient=patient, name=name, value=json.dumps(value)))
@@ -109,28 +117,33 @@ class VisitRepository:
 
         return self.get(self.requests.run_in_transaction(key, f"answer {id} {name} {json.dumps(value)}", act))
 
-    def finish(self, key: str, id: str) -> Visit:
+    def finish(self, key: str, id: str, user: str = "") -> Visit:
         """Finish a visit with its present captures and compute its outcome; a finished visit stays unchanged."""
 
         def act(session: Session) -> str:
             row = visit_queries.visit_row(session, id)
             if row.finished_at is None:
-                visit_rows.finish(session, self.programme, row, schema.utc_text(self.clock.wall()))
+                visit_rows.finish(session, self.programme, row, schema.utc_text(self.clock.wall()), user)
             return id
 
         return self.get(self.requests.run_in_transaction(key, f"finish {id}", act))
 
-    def reopen(self, key: str, id: str) -> Visit:
-        """Undo the finish of a visit and delete its outcome; VisitFinished after the local day of the finish."""
+    def reopen(self, key: str, id: str, reason: ReopenReason, user: str = "") -> Visit:
+        """Undo the finish of a visit and delete its outcome, which its history keeps with the reason.
+
+        VisitFinished after the local day of the finish.
+        """
 
         def act(session: Session) -> str:
             row = visit_queries.visit_row(session, id)
             if row.finished_at is not None and self._end_of_undo(datetime.fromisoformat(row.finished_at)) is None:
                 raise VisitFinished(f"{row.patient} was finished on an earlier day")
+            now = schema.utc_text(self.clock.wall())
+            visit_rows.record_change(session, id, "outcome", visit_rows.outcome_code(row), None, now, user, reason)
             row.finished_at = row.outcome = None
             return id
 
-        return self.get(self.requests.run_in_transaction(key, f"reopen {id}", act))
+        return self.get(self.requests.run_in_transaction(key, f"reopen {id} {reason}", act))
 
     def undo_until(self, visit: Visit) -> datetime | None:
         """Return the end of the local day on which a visit was finished, until which `reopen` is possible.

@@ -2,12 +2,16 @@
 
 import json
 
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from services.errors import VisitFinished
 from services.records import visit_queries
+from services.records.json_values import FormValue, JsonValue
 from services.records.programme import Programme
-from services.records.schema import SlotDecisionRow, VisitRow
+from services.records.record_document import as_object
+from services.records.row_validation import parsed_json, reading_record
+from services.records.schema import ChangeRow, SlotDecisionRow, VisitRow
 from services.records.visit import SlotDecision, decide_outcome
 
 
@@ -19,10 +23,40 @@ def unfinished_row(session: Session, id: str) -> VisitRow:
     return row
 
 
-def finish(session: Session, programme: Programme, row: VisitRow, at: str) -> None:
-    """Store the outcome of a visit, computed from its present answers and slots, and the time (UTC text) of its end."""
+def record_change(
+    session: Session,
+    visit: str,
+    field: str,
+    was: JsonValue,
+    value: FormValue,
+    at: str,
+    user: str,
+    why: str | None = None,
+) -> None:
+    """Add one change of a visit at a time (UTC text) to its history; no effect if nothing changes."""
+    if was == value:
+        return
+    number = session.scalar(select(func.max(ChangeRow.number)).where(ChangeRow.visit == visit)) or 0
+    values = {"was": json.dumps(was), "value": json.dumps(value)}
+    session.add(ChangeRow(visit=visit, number=number + 1, at=at, user=user, field=field, why=why, **values))
+
+
+def outcome_code(row: VisitRow) -> JsonValue:
+    """Return the code of the stored outcome, None in an unfinished visit; StoreDamaged if it cannot be read."""
+    if row.outcome is None:
+        return None
+    with reading_record(row.id):
+        return as_object(parsed_json(row.outcome))["code"]
+
+
+def finish(session: Session, programme: Programme, row: VisitRow, at: str, user: str = "") -> None:
+    """Store the outcome of a visit, computed from its present answers and slots, and the time (UTC text) of its end.
+
+    `user`: who finished it, "" for the device, as after a late picture.
+    """
     visit = visit_queries.read_visit(session, programme, row)
     ending = decide_outcome(programme, visit.fields, visit.slots)
+    record_change(session, row.id, "outcome", outcome_code(row), ending.code, at, user)
     row.outcome = json.dumps({"code": ending.code, "sentence": ending.sentence})
     row.finished_at = at
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 from device.clock import Clock
 from services.errors import UpdateError, UpdateNotFound, UpdateSourceRemoved
-from services.update import channel, preconditions, sources
+from services.update import channel, preconditions, signers, sources
 from services.update.ipc import FoundUpdate, StoredError
-from services.update.rauc import Rauc
+from services.update.rauc import Rauc, Release
 from services.update.settings import UpdateSettings
 from services.update.sources import Progress
+from services.update.state import StateFile
 
 log = logging.getLogger(__name__)
 
@@ -24,13 +25,13 @@ class AvailableUpdates:
     The caller holds the update lock during `on_drives`, `fetch`, `fetch_found` and `download`.
     """
 
-    def __init__(self, settings: UpdateSettings, clock: Clock, rauc: Rauc, runs: str) -> None:
-        self._settings, self._clock, self._rauc, self._runs = settings, clock, rauc, runs
+    def __init__(self, settings: UpdateSettings, clock: Clock, rauc: Rauc, runs: str, state: StateFile) -> None:
+        self._settings, self._clock, self._rauc, self._runs, self._state = settings, clock, rauc, runs, state
 
     def newer_offer(self) -> channel.Offer | None:
         """Return the channel's offer if it is newer than the running version, else None.
 
-        UpdateNotFound if no channel is set.
+        UpdateNotFound if no channel is set, UpdateStale for an old file of the channel.
         """
         offer = self._offer()[1]
         is_newer = preconditions.parse_version(offer.version) > preconditions.parse_version(self._runs)
@@ -72,6 +73,13 @@ class AvailableUpdates:
                 return web.download(offer, self._settings.folder, progress)
         raise UpdateSourceRemoved("what was chosen is not there any more", REMOVED_DRIVE_REMEDY)
 
+    def release(self, bundle: Path) -> Release:
+        """Return the metadata of a bundle; errors of `Rauc.release`, UpdateUntrusted also for a revoked signer."""
+        release = self._rauc.release(bundle)
+        if revoked := self._state.read().revoked:
+            signers.refuse_revoked(signers.bundle_certificates(bundle), revoked)
+        return release
+
     def _assessed(self, found: FoundUpdate, path: Path) -> FoundUpdate:
         """Return the entry with version, estimated duration and reason for refusal of the bundle at `path`.
 
@@ -83,7 +91,7 @@ class AvailableUpdates:
             copy = sources.copy_bundle(path, folder, _log_progress)
             copy_s = self._clock.now_s() - begin_s
             takes_s = tuple(times * copy_s + more_s for times, more_s in zip(BUNDLE_READS, RESTART_S, strict=True))
-            release = self._rauc.release(copy)
+            release = self.release(copy)
             found = found.model_copy(update={"version": release.version, "takes_s": takes_s})
             preconditions.refuse_unsuitable(release, self._rauc.compatible(), self._runs, self._settings.modules)
         except UpdateError as error:
@@ -93,8 +101,14 @@ class AvailableUpdates:
         return found
 
     def _offer(self) -> tuple[sources.UpdateServer, channel.Offer]:
-        server = self._server()
-        return server, channel.verify_channel(server.read_small_file(channel.CHANNEL_FILE), self._settings.keyring)
+        server, seen = self._server(), self._state.read()
+        content = server.read_small_file(channel.CHANNEL_FILE)
+        offer = channel.verify_channel(content, self._settings.keyring, seen.revoked)
+        channel.refuse_stale(offer, seen.channel_number, self._clock.wall().date())
+        revoked = tuple(sorted({*seen.revoked, *offer.revoked}))
+        if (offer.number, revoked) != (seen.channel_number, seen.revoked):
+            self._state.write(channel_number=offer.number, revoked=revoked)
+        return server, offer
 
     def _server(self) -> sources.UpdateServer:
         if not self._settings.channel:

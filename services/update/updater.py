@@ -34,7 +34,7 @@ class Updater:
         self._rauc = Rauc(settings.rauc)
         self._journal = StateFile(settings.folder)
         self.running_version = runs or version("diffuscope")
-        self._available = AvailableUpdates(settings, clock, self._rauc, self.running_version)
+        self._available = AvailableUpdates(settings, clock, self._rauc, self.running_version, self._journal)
         self._reported = (-1, "")
 
     def check(self, download: bool = False) -> channel.Offer | None:
@@ -117,7 +117,7 @@ class Updater:
             sources.remove_copy(settings.folder)
             self._journal.write(state="fetching", version="", before=self.running_version, share=0.0, ill=ill)
             bundle = fetch()
-            release = self._rauc.release(bundle)
+            release = self._available.release(bundle)
             preconditions.refuse_unsuitable(
                 release, self._rauc.compatible(), self.running_version, self._settings.modules
             )

@@ -20,6 +20,7 @@ from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
 from device.recon.estimation.refraction.estimator import RefractionEstimator, can_estimate_refraction
 from device.recon.model.fft_plans import Planner
 from device.values import Calibration, ExposureSettings
+from services.identity.audit_key import find_audit_key
 from services.instrument.calibration_monitor import (
     CHECKED_CAPTURES,
     captures_with_calibration,
@@ -91,7 +92,7 @@ def _load_captures(spec: InstrumentSpec, calibration_id: str, data: Path) -> lis
     refuse_earlier_store(data / schema.DATABASE)
     if not (data / schema.DATABASE).is_file():
         return []
-    with CaptureStore(data) as store:
+    with CaptureStore(data, key=find_audit_key(data)) as store:
         return list(captures_with_calibration(store, calibration_id, in_force_since(spec)))
 
 
@@ -99,7 +100,7 @@ def _sights_of_captures(
     spec: InstrumentSpec, kept: StoredCalibration, taken: list[Capture], data: Path
 ) -> list[CaptureAssessment]:
     psf_check = _psf_check(spec, kept.calibration)
-    with CaptureStore(data) as store:
+    with CaptureStore(data, key=find_audit_key(data)) as store:
         found = [exposures(store, capture) for capture in taken[-CHECKED_CAPTURES:]]
     return [assess_capture(kept.calibration, kept.provenance, psf_check, exposure) for exposure in found]
 

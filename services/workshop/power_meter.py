@@ -22,6 +22,7 @@ from device.head import hazard_of, open_light, refuse_without_lamp, with_calibra
 from device.light_safety.dose_ledger import Ledger
 from device.light_safety.hazard import LED_POWER_UNCERTAINTY, light_limits
 from device.values import Illumination
+from services.identity.audit_key import find_audit_key
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.workshop.light_report import AXIS_DISTANCE_MM, AXIS_HOLE_MM, AXIS_HOLE_SR, GUARD, expected_uw
@@ -95,7 +96,7 @@ def give_pulses(run: MeterRun, data: Path, clock: Clock, progress: Callable[[str
 
     Errors of the store, the guard and the lamp, which is then dark.
     """
-    with CaptureStore(data, clock=clock) as store:
+    with CaptureStore(data, clock=clock, key=find_audit_key(data)) as store:
         pulse(run, DoseLedgerStore(store.engine, clock, light_limits().window_s), clock, progress)
 
 

@@ -1,16 +1,19 @@
 """Software bill of materials (CycloneDX) of a root file system: every Debian and every Python package.
 
 Run by `systemd/image/release`: `python systemd/image/sbom.py ROOT VERSION GIT_ID` writes JSON to standard output. The
-source is the content of the root, not the list of requested packages. Standard library only.
+source is the content of the root, not the list of requested packages; Python packages that are not those of the lock
+file are an error. Standard library only.
 """
 
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from email import message_from_string
 from email.message import Message
 from pathlib import Path
+
+LOCK = Path(__file__).with_name("requirements.lock")
 
 
 def debian(root: Path) -> Iterator[dict[str, object]]:
@@ -42,6 +45,19 @@ def licence_of(fields: Message) -> str:
     return str(fields["License-Expression"] or " / ".join(classifiers) or (fields["License"] or "").split("\n")[0])
 
 
+def differences(found: Iterable[dict[str, object]], lock: str) -> list[str]:
+    """Return the packages that differ from a lock file; one with a marker may be missing on this system."""
+    locked: dict[str, set[str]] = {}
+    for name, version in re.findall(r"^([a-z0-9-]+)==([^\s;]+)", lock, re.MULTILINE):
+        locked.setdefault(name, set()).add(version)
+    needed = set(re.findall(r"^([a-z0-9-]+)==[^\s;]+ *\\?$", lock, re.MULTILINE))
+    there = {re.sub(r"[-_.]+", "-", str(part["name"])).lower(): str(part["version"]) for part in found}
+    wrong = [
+        f"{name} {version} is not locked" for name, version in there.items() if version not in locked.get(name, ())
+    ]
+    return sorted(wrong + [f"{name} is missing" for name in needed - there.keys()])
+
+
 def bill(root: Path, version: str, git_id: str) -> dict[str, object]:
     """Return the bill of materials; its order does not depend on the file system."""
     parts = sorted([*debian(root), *python(root)], key=lambda part: str(part["purl"]))
@@ -57,4 +73,6 @@ def bill(root: Path, version: str, git_id: str) -> dict[str, object]:
 
 
 if __name__ == "__main__":
+    if wrong := differences(python(Path(sys.argv[1])), LOCK.read_text(encoding="utf-8")):
+        sys.exit("\n".join(wrong))
     sys.stdout.write(json.dumps(bill(Path(sys.argv[1]), sys.argv[2], sys.argv[3]), indent=1) + "\n")

@@ -226,6 +226,8 @@ def test_channel_update_resumes_after_a_lost_connection(bench: Bench, bundles: B
         "bundle": bundles.newer.name,
         "bytes": len(content),
         "sha256": hashlib.sha256(content).hexdigest(),
+        "number": 1,
+        "expires": "9999-12-31",
     }
     certificate, key = identity(tmp_path)
     with serve(certificate, key) as site, bench.service():
@@ -258,8 +260,9 @@ def test_wrong_clock_does_not_prevent_an_update(bench: Bench, bundles: Bundles, 
 def test_wrong_clock_accepts_the_channel_and_refuses_its_server_with_a_remedy(
     bundles: Bundles, tmp_path: Path, date: str
 ) -> None:
-    """A signed channel has no expiry date; a web server's certificate has one, and a USB drive needs none."""
+    """A signature holds at any date; a web server's certificate does not, and a USB drive needs none."""
     offer = {"compatible": "diffuscope-pi5", "version": "2.0", "bundle": "a.raucb", "bytes": 1, "sha256": "0" * 64}
+    offer |= {"number": 1, "expires": "2030-01-01"}
     (tmp_path / "channel.cms").write_bytes(signed(bundles.workshop.keys, json.dumps(offer).encode()))
     certificate, key = identity(tmp_path)
     with serve(certificate, key) as site:

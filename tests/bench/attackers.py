@@ -5,6 +5,7 @@ import random
 import resource
 import select
 import socket
+import ssl
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -46,6 +47,13 @@ ATTACKS = {
 }
 
 
+def untrusting_context() -> ssl.SSLContext:
+    """Return the TLS context of a client that takes any certificate."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    return context
+
+
 @contextmanager
 def under_attack(name: str, host: str, port: int, reopen_s: float = REOPEN_S) -> Iterator[None]:
     """Attack a server from another process, beginning with the opening of all connections."""
@@ -80,7 +88,7 @@ class _Crowd:
 
     def __init__(self, attack: Attack, host: str, port: int, reopen_s: float) -> None:
         self._attack, self._address, self._reopen_s = attack, (host, port), reopen_s
-        self._poll = select.poll()
+        self._poll, self._tls = select.poll(), untrusting_context()
         self._sockets: dict[int, tuple[int, socket.socket]] = {}
         self._due: list[tuple[float, int]] = []
         self._trickled_s = time.monotonic()
@@ -92,7 +100,9 @@ class _Crowd:
         try:
             client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536 if self._attack.reads else 4096)
             client.connect(self._address)
-            client.sendall(self._attack.opening(k))
+            if opening := self._attack.opening(k):  # an idle connection does not begin its handshake either
+                client = self._tls.wrap_socket(client)
+                client.sendall(opening)
         except OSError:
             self._close(k, client)
             return
@@ -132,6 +142,8 @@ class _Crowd:
                 return False  # a refused client tries again later
             if answer and self._attack.repeated:
                 client.send(self._attack.repeated)
+        except ssl.SSLWantReadError:
+            return True  # a record of TLS without bytes of an answer
         except OSError:
             return False
         return bool(answer)

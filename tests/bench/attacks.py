@@ -26,9 +26,11 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
+from device.clock import SystemClock
+from services.identity.certificates import create_authority, create_server_certificate
 from services.identity.users import FOLDER, ROLES, UserTable
 from tests.bench import timing
-from tests.bench.attackers import ATTACKS, REOPEN_S, under_attack
+from tests.bench.attackers import ATTACKS, REOPEN_S, under_attack, untrusting_context
 
 ROOT = Path(__file__).parents[2]
 PIN = "274913"
@@ -51,7 +53,7 @@ class Seen:
 class Instrument:
     """`diffuscope run` of one tree with the simulated head, at the open files of its unit.
 
-    `is_open`: served to the whole network, so for a user who signs in; else for the demonstration user.
+    `is_open`: served to the whole network, so by TLS and for a user who signs in.
     """
 
     def __init__(self, tree: Path, data: Path, is_open: bool = False) -> None:
@@ -65,11 +67,11 @@ class Instrument:
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[bytes]]:
         """Run the server until the end of the context, from the moment on when it accepts a press."""
-        host = "0.0.0.0" if self._is_open else "127.0.0.1"
-        words = ["run", "--head", "hardware/heads/sim.toml", "--host", host, "--port", str(self.port)]
-        users = UserTable(self._data / FOLDER)
-        if self._is_open and not users.has_begun:
-            users.add("Asha", PIN, ROLES)
+        words = ["run", "--head", "hardware/heads/sim.toml", "--port", str(self.port)]
+        if self._is_open:
+            self._write_identity()
+            files = (str(self._data / "server.crt"), "--certificate-key", str(self._data / "server.key"))
+            words += ["--host", "0.0.0.0", "--certificate", *files]
         command = [str(self._tree / ".venv/bin/diffuscope"), *words, "--data", str(self._data)]
         with self._log.open("wb") as log:
             process = subprocess.Popen(command, cwd=self._tree, stdout=log, stderr=log, preexec_fn=self._limit_files)
@@ -90,7 +92,7 @@ class Instrument:
         """Send one request on a connection of its own; return the answer. OSError for no answer or another status."""
         content = None if body is None else json.dumps(body)
         headers = {"Content-Type": "application/json", "Connection": "close", "Cookie": self._cookie}
-        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)) as connection:
+        with closing(self._connection()) as connection:
             connection.request(method, path, content, headers)
             answer = connection.getresponse()
             read = answer.read()
@@ -102,6 +104,19 @@ class Instrument:
     def log_bytes(self) -> int:
         """Return the size of the log."""
         return self._log.stat().st_size
+
+    def _connection(self) -> http.client.HTTPConnection:
+        if self._is_open:
+            return http.client.HTTPSConnection("127.0.0.1", self.port, timeout=TIMEOUT_S, context=untrusting_context())
+        return http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)
+
+    def _write_identity(self) -> None:
+        """Add the user of the presses, and write a key with its certificate."""
+        if not (users := UserTable(self._data / FOLDER)).has_begun:
+            users.add("Asha", PIN, ROLES)
+        key, certificate = create_server_certificate(*create_authority("bench", SystemClock()), "bench", SystemClock())
+        for name, content in (("server.key", key), ("server.crt", certificate)):
+            (self._data / name).write_bytes(content)
 
     def _state(self) -> str | None:
         try:

@@ -37,6 +37,8 @@ def offer(keys: Path, bundle: bytes) -> bytes:
         "bundle": "test.raucb",
         "bytes": len(bundle),
         "sha256": hashlib.sha256(bundle).hexdigest(),
+        "number": 1,
+        "expires": "9999-12-31",
     }
     return signed(keys, json.dumps(content).encode())
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import timedelta
+from pathlib import Path
 
 from playwright.sync_api import Page, expect
 
@@ -80,6 +81,11 @@ def date(days: int) -> Cause:
         real.clock.moved = timedelta(days=value)
 
     return reading(lambda real: change(real, days), lambda real: change(real, 0))
+
+
+def clock_folder(real: Real) -> Path:
+    """Return the folder in which a device leaves the time of a tablet, if it has no other."""
+    return real.rig.store.folder.parent / "system/run/diffuscope-clock"
 
 
 def dose(ago_s: float) -> Cause:
@@ -165,6 +171,9 @@ CAUSES: dict[str, Cause] = {
     "batt.empty": charge(0.03),
     "store.low": free_space(5 * 4 * 10_000_000),
     "store.full": free_space(0),
+    "clock.unset": reading(
+        lambda real: clock_folder(real).mkdir(parents=True), lambda real: clock_folder(real).rmdir()
+    ),
     "clock.wrong": date(-2500),
     "link.other": other_screen,
     "consent.missing": consent(None),

@@ -27,7 +27,7 @@ SPECIFIED = set(
         light.cut shot.lost shot.crossed shot.next
         shot.saturated shot.dark shot.pupil shot.moved shot.blink shot.noeye shot.edge shot.halo shot.poor
         make.slow make.failed store.low store.full batt.low batt.empty heat.warm heat.hot power.lost link.lost
-        link.slow link.other clock.wrong send.waiting send.stuck eye.side consent.missing consent.declined
+        link.slow link.other clock.unset clock.wrong send.waiting send.stuck eye.side consent.missing consent.declined
         """,
     )
 )
@@ -51,6 +51,7 @@ ADVISORY = [
     "power.lost",
     "batt.low",
     "store.low",
+    "clock.unset",
     "clock.wrong",
     "send.stuck",
     "make.slow",

@@ -238,8 +238,14 @@ def test_finished_visit_is_read_only_until_reopened(open_page: Open, real: Real,
         expect(page.locator("#done")).to_be_visible()
     assert real.presses == 1
     tap(page, "#reopen")
+    assert look_for_faults(page, "#done") == []
+    tap(page, "[data-reason=answer]")
     wait_for_preview(page)
     assert real.visit()["finished_at"] is None
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/pictures")
+    tap(page, "#changes")
+    expect(page.locator(".changes li").last).to_contain_text("An answer is wrong")
+    assert look_for_faults(page) == []
 
 
 def test_visit_of_earlier_day_cannot_be_reopened(open_page: Open, real: Real) -> None:
@@ -260,6 +266,7 @@ def test_error_alert_is_cleared_on_screen_change(open_page: Open, real: Real, co
     page.wait_for_function(LOADED_AFTER_FINISH)
     real.clock.advance(DAY_S)
     tap(page, "#reopen")
+    tap(page, "[data-reason=answer]")
     expect(page.locator(".state-bar")).to_contain_text("was finished on an earlier day")
     tap(page, "#done")
     page.wait_for_selector("#new")

@@ -7,6 +7,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from device.values import BatteryState
+from tests.browser.alert_causes import clock_folder
 from tests.browser.conftest import Complaints
 from tests.browser.real import Real
 from tests.browser.walk import SHUTTER, Open, after_debounce, agree, take_picture, tap, visit_of, wait_for_preview
@@ -100,6 +101,19 @@ def test_full_storage_during_visit_keeps_captures(open_page: Open, real: Real) -
     expect_ended(page, "store.low")
     take_picture(page)
     assert len(real.rig.store.captures()) == len(kept) + 1
+
+
+def test_the_time_of_the_tablet_is_left_for_the_device_when_its_user_accepts_it(open_page: Open, real: Real) -> None:
+    """A device without network and clock cell, whose date is a month old."""
+    page, folder = aiming(open_page, real), clock_folder(real)
+    real.clock.moved = timedelta(days=-30)
+    folder.mkdir(parents=True)
+    expect_chip(page, "clock.unset", rf"The device does not know the date\. Is it .*{datetime.now(UTC).year}, ")
+    assert list(folder.iterdir()) == []
+    page.locator("[data-code='clock.unset'] [data-do=timeIsRight]").tap()
+    expect_ended(page, "clock.unset")
+    accepted = datetime.fromisoformat((folder / "request").read_text())
+    assert abs(datetime.now(UTC) - accepted) < timedelta(minutes=2)
 
 
 @pytest.mark.parametrize("to", [datetime(2020, 1, 2, 12, tzinfo=UTC), datetime.now(UTC) + timedelta(days=300)])

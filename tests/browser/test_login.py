@@ -14,6 +14,7 @@ from tests.simulated import small_head_toml
 
 Open = Callable[..., Page]
 PIN = "274913"
+PRESS_MS = 700  # a press within this time after another one, or after the page has changed by itself, does not count
 SIZES = ((1280, 800), (360, 740), (800, 1280))
 
 
@@ -66,6 +67,20 @@ def test_users_sign_in_lock_and_are_managed(own_server: Server, open_page: Open,
     sign_in(page, "asha")
     expect(page.locator("dialog.login")).to_be_hidden()
     assert page.url == before
+
+    page.wait_for_timeout(PRESS_MS)
+    page.locator("#open-menu").tap()
+    page.locator("#own-secret").tap()
+    for name, pin in (("secret", PIN), ("new", "918274"), ("again", "918275")):
+        page.locator(f"dialog.login [name={name}]").fill(pin)
+    assert faults(page) == []
+    page.keyboard.press("Enter")
+    expect(page.locator("dialog.login [role=alert]")).to_contain_text("differ")
+    page.wait_for_timeout(PRESS_MS)
+    page.locator("dialog.login [name=again]").fill("918274")
+    page.keyboard.press("Enter")
+    expect(page.locator("dialog.login")).to_be_hidden()
+    assert UserTable(own_server.data / FOLDER).verify("Asha", "918274") is not None
 
     page.goto(f"{own_server.url}/technician")
     page.locator("[data-section=users]").tap()

@@ -317,6 +317,7 @@ def test_finished_visit_is_reopened_and_qr_code_has_no_name(open_page: Open, mak
     expect(page.locator(".slip")).not_to_contain_text("Lakshmi")
     page.emulate_media(media="screen")
     tap(page, "#reopen")
+    tap(page, "[data-reason=mistake]")
     wait_for_preview(page)
     assert real.visit()["finished_at"] is None
 

@@ -147,10 +147,13 @@ def _ends(log: Transcript, at: str, id: str) -> None:
     log.ask(finish, f"/api/visits/{UNKNOWN_VISIT}/finish", json=log.key())
     log.ask("PATCH /api/visits/{id}", at, json=log.key(field="age", value=55), note="the visit is finished")
     log.ask("POST /api/captures", json=log.key(eye="OD", visit=id, slot="R-centre"), note="the visit is finished")
-    log.ask(reopen, f"{at}/reopen", json=log.key())
+    log.ask(reopen, f"{at}/reopen", json=log.key(), note="without a reason")
+    log.ask(reopen, f"{at}/reopen", json=log.key(reason="answer"))
+    log.ask("GET /api/visits/{id}/changes", f"{at}/changes")
+    log.ask("GET /api/visits/{id}/changes", f"/api/visits/{UNKNOWN_VISIT}/changes")
     log.ask(finish, f"{at}/finish", json=log.key())
     log.instrument.clock.elapsed_s += 3 * 86400
-    log.ask(reopen, f"{at}/reopen", json=log.key(), note="three days later")
+    log.ask(reopen, f"{at}/reopen", json=log.key(reason="answer"), note="three days later")
 
 
 def _controllers(log: Transcript) -> None:
@@ -257,6 +260,7 @@ def access() -> list[dict[str, Any]]:
         log.ask("GET /api/login")
         _users(log)
         log.ask("GET /api/audit", "/api/audit?action=sign-in&limit=2")
+        _clock(log)
         log.ask("POST /api/login/activity")
         log.ask("POST /api/login/confirm", json={"secret": "000000"})
         device.clock.elapsed_s += 2
@@ -279,6 +283,17 @@ def access() -> list[dict[str, Any]]:
         device.clock.elapsed_s += 400
         log.ask("GET /api/login", note="after the idle lock")
         return log.exchanges
+
+
+def _clock(log: Transcript) -> None:
+    """Record the acceptance of a tablet's time, at a device that has one and at a device that has none."""
+    later, earlier = {"now": "2027-01-01T12:00:00+05:30"}, {"now": "2026-01-01T05:30:00+05:30"}
+    log.ask("POST /api/clock", json=log.key(**later), note="nothing sets the clock")
+    log.ask("POST /api/clock/back", json=log.key(**earlier), note="nothing sets the clock")
+    (log.instrument.folder / "system/run/diffuscope-clock").mkdir(parents=True)
+    log.ask("POST /api/clock", json=log.key(**earlier), note="before the time of the device")
+    log.ask("POST /api/clock", json=log.key(**later))
+    log.ask("POST /api/clock/back", json=log.key(**earlier))
 
 
 def _users(log: Transcript) -> None:

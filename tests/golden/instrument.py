@@ -259,6 +259,7 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
             technician_routers=rooms,
             uploader=carrier,
             audit_log=AuditLog(folder / "data", b"k" * 32, clock),
+            system=folder / "system",
         )
         if calibrated_before:
             assert owner.exam.ready.wait(120)

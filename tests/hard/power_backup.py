@@ -9,7 +9,7 @@ import pyrage
 
 from device.clock import VirtualClock
 from services.backup.backup_folder import find_folder
-from services.backup.backup_key import SecretKey, key_for_recipients, write_key
+from services.backup.backup_key import SecretKey, key_for_recipients, key_in, read_header, write_key
 from services.backup.restore_backup import restore_backup
 from services.backup.write_backup import write_backup
 from services.records.capture import Capture, CaptureReport
@@ -32,15 +32,16 @@ def save(store: Path, *names: str) -> None:
 
 
 def secret_key(folder: Path) -> SecretKey:
-    return SecretKey((folder / KEY_FILE).read_text())
+    return key_in(folder / KEY_FILE, read_header(find_folder(folder / "stick")))
 
 
 def with_backup(folder: Path) -> None:
     """Prepare a device with one capture, and a stick with its backup."""
-    (folder / KEY_FILE).write_text(str(IDENTITY))
+    key = key_for_recipients([str(IDENTITY.to_public())])
+    (folder / KEY_FILE).write_text(f"{IDENTITY}\n{key.line}\n")
     (folder / "stick").mkdir()
     save(folder / "device", "before")
-    write_key(folder / "device", key_for_recipients([secret_key(folder).public_key]))
+    write_key(folder / "device", key)
     write_backup(folder / "device", folder / "stick", VirtualClock(), quiet)
     save(folder / "device", "later")
 

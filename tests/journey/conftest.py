@@ -113,7 +113,7 @@ class Rig:
             transport = httpx.ASGITransport(app=self.app, **options)
             own = {"Sec-Fetch-Site": "same-origin"}  # header of a same-origin page
             async with httpx.AsyncClient(
-                transport=transport, base_url="http://eye.local", timeout=30, headers=own
+                transport=transport, base_url="http://diffuscope.local", timeout=30, headers=own
             ) as client:
                 return await use_client(client)
 
@@ -234,7 +234,10 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         )
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = Authenticator(folder / "access", clock, has_demo=True)
-        build_app = partial(create_app, owner, door, programme, uploader=carrier, usb_drives=sticks)
+        # Virtual time stands still, so that tests would reach the limits in rate.
+        build_app = partial(
+            create_app, owner, door, programme, uploader=carrier, usb_drives=sticks, rates={}, system=folder / "system"
+        )
         clock.world = scene
         return Rig(scene, clock, records, event_bus, exam, owner, door, build_app, died)
 

@@ -224,6 +224,16 @@ def without_consent(value: str | None) -> Callable[[Rig, DiskStub], Observation]
     return scenario
 
 
+def no_date(rig: Rig, disk: DiskStub) -> Observation:
+    """A device without network and clock cell, where the unit that sets the clock takes requests."""
+    folder = rig.store.folder.parent / "system/run/diffuscope-clock"
+    folder.mkdir(parents=True)
+    try:
+        return active_alert(rig, "clock.unset")
+    finally:
+        folder.rmdir()
+
+
 def wrong_date(rig: Rig, disk: DiskStub) -> Observation:
     rig.clock.start -= timedelta(days=365 * 6)
     return active_alert(rig, "clock.wrong")
@@ -366,6 +376,7 @@ SCENARIOS: dict[str, Callable[[Rig, DiskStub], Observation]] = {
     "consent.declined": without_consent("declined"),
     "send.waiting": upload_waiting,
     "send.stuck": upload_stuck,
+    "clock.unset": no_date,
     "clock.wrong": wrong_date,
     "eye.side": other_eye,
 }

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import pytest
 
 from device.clock import VirtualClock
 from services.errors import AuthenticationError
+from services.health.clock_request import REQUEST
 from services.http.access import ACCESS, Access
 from services.http.app import create_app
 from services.http.authentication import OWN_SCREEN, Authenticator, Peer
+from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
 from services.identity.users import ROLES, Role
@@ -34,7 +37,7 @@ def ask(
     async def send() -> httpx.Response:
         transport = httpx.ASGITransport(app=app, client=client)
         headers = {"X-Controller": "test"} | ({} if token is None else {"Cookie": f"login={token}"})
-        async with httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30) as browser:
+        async with httpx.AsyncClient(transport=transport, base_url="http://diffuscope.local", timeout=30) as browser:
             return await browser.request(method, path, headers=headers | options.pop("headers", {}), **options)
 
     return asyncio.run(send())
@@ -97,14 +100,15 @@ def test_each_operation_admits_its_roles_and_refuses_all_others(rig: Rig) -> Non
     pages = [("GET", "/"), ("GET", "/technician"), ("GET", "/web/{name:path}")]
     for verb, path in [one for one in operations(rig.app.openapi()) if one not in left_out] + pages:
         rule = ACCESS[f"{verb} {path}"]
-        for name, token in {**signed_in, "none": None, "guessed": "a" * 43, "expired": expired}.items():
+        others = {"none": None, "guessed": "a" * 43, "expired": expired, "revoked": revoked}
+        for name, token in (signed_in | others).items():
             if not admits(rule, name) or name == "administrator" or verb in SAFE_METHODS:
                 tried += 1
                 at = filled(path) if name == "technician" else filled(path).replace("preview", "preview?visit=none")
                 if admits(rule, name) == is_refused(ask(rig.app, verb, at, token, json=body(verb))):
                     wrong.append((verb, path, name))
     assert wrong == []
-    assert tried > 250
+    assert tried > 480
 
 
 def body(verb: str) -> Any:
@@ -190,7 +194,7 @@ def test_over_tls_the_cookie_is_bound_to_the_host(fresh: Rig) -> None:
 
     async def cookie() -> str:
         transport = httpx.ASGITransport(app=fresh.app, client=AWAY)
-        async with httpx.AsyncClient(transport=transport, base_url="https://eye.local") as browser:
+        async with httpx.AsyncClient(transport=transport, base_url="https://diffuscope.local") as browser:
             answer = await browser.post("/api/login", json={"name": "Asha", "secret": PIN})
             return answer.headers["set-cookie"]
 
@@ -255,7 +259,7 @@ def test_a_risk_needs_the_secret_again_and_polling_does_not_extend_a_login(fresh
 def test_an_event_stream_ends_with_its_login(fresh: Rig) -> None:
     fresh.authenticator.users.add("Asha", PIN, ["reader", "administrator"])
     token = fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)
-    cookie = {"Cookie": f"login={token}", "Host": "eye.local"}
+    cookie = {"Cookie": f"login={token}", "Host": "diffuscope.local"}
 
     def sign_out() -> None:
         fresh.authenticator.logins.end(token)
@@ -281,10 +285,59 @@ def test_a_remote_client_cannot_keep_the_device_locked(fresh: Rig) -> None:
     assert here.status_code == 200
 
 
+@pytest.mark.parametrize("operation", RATES)
+def test_operations_are_limited_in_rate(operation: str, fresh: Rig) -> None:
+    """Beyond the burst a request waits for its interval; another user, or another address, does not wait."""
+    for name in ("Asha", "Ravi"):
+        fresh.authenticator.users.add(name, PIN, ROLES)
+    tokens = [fresh.authenticator.sign_in(name, PIN, OWN_SCREEN) for name in ("Asha", "Ravi")]
+    rate, (verb, path) = RATES[operation], operation.split()
+    app = create_app(fresh.arbiter, fresh.authenticator).http
+
+    def ask_as(token: str, client: tuple[str, int] = AWAY) -> tuple[int, float | None]:
+        answer = ask(app, verb, path, token, client, json={})  # an empty body is refused after the count
+        return answer.status_code, answer.json().get("wait_s")
+
+    assert 429 not in {ask_as(tokens[0])[0] for _ in range(rate.burst)}
+    assert ask_as(tokens[0]) == (429, rate.interval_s)
+    assert ask_as(tokens[1], HERE)[0] != 429
+    fresh.clock.sleep(rate.interval_s)
+    assert ask_as(tokens[0])[0] != 429
+    assert ask_as(tokens[0])[0] == 429
+
+
+def test_the_time_of_a_tablet_is_accepted_forward_and_an_administrator_sets_it_back(fresh: Rig, tmp_path: Path) -> None:
+    """The request for the unit that sets the clock, and an entry with both times."""
+    log, request = AuditLog(tmp_path, b"k" * 32, fresh.clock), tmp_path / REQUEST
+    fresh.clock.start += timedelta(days=60)  # after the earliest possible date
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log, system=tmp_path).http
+    fresh.authenticator.users.add("Asha", PIN, ["administrator"])
+    fresh.authenticator.users.add("Ravi", PIN, ["reader"])
+    asha, ravi = (fresh.authenticator.sign_in(name, PIN, OWN_SCREEN) for name in ("Asha", "Ravi"))
+    request.parent.mkdir(parents=True)
+    present = fresh.clock.wall()
+    later, earlier = ((present + timedelta(days=days)).isoformat() for days in (9, -9))
+
+    def ask_as(token: str, now: str, path: str = "/api/clock") -> tuple[int, str | None]:
+        answer = ask(app, "POST", path, token, json={"key": "0" * 16, "now": now})
+        return answer.status_code, answer.json().get("code")
+
+    assert ask_as(ravi, earlier) == (409, "clock.back")
+    assert ask_as(ravi, earlier, "/api/clock/back")[0] == 403
+    assert not request.exists()
+    assert ask_as(ravi, later) == (200, None)
+    assert datetime.fromisoformat(request.read_text()) == present + timedelta(days=9)
+    assert ask_as(asha, earlier, "/api/clock/back") == (200, None)
+    assert request.read_text().startswith("back ")
+    fields = [(entry.user, entry.action, entry.more["field"]) for entry in log.entries(2)]
+    both = f"{present.isoformat()} "
+    assert fields == [("Asha", "set-clock-back", both + earlier), ("Ravi", "set-clock", both + later)]
+
+
 def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:
-    """Sign-in, its failure, view, change, refused light: user, record and field, and no value."""
+    """Sign-in, its failure, view, change, refused light: user, record, field, no value; a stranger fills no disk."""
     log = AuditLog(tmp_path, b"k" * 32, fresh.clock)
-    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log, system=tmp_path).http
     fresh.authenticator.users.add("Asha", PIN, ROLES)
     ask(app, "POST", "/api/login", json={"name": "Asha", "secret": "000000"})
     fresh.clock.sleep(1)
@@ -295,7 +348,8 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
     for _ in range(3):
         ask(app, "GET", at, token)
     ask(app, "POST", "/api/captures", token, json={"key": "2" * 16, "eye": "OD", "visit": visit, "slot": "R-centre"})
-    ask(app, "GET", at)
+    for _ in range(3):
+        ask(app, "GET", at)
     found = [(one.user, one.action, one.record, one.more.get("field"), one.more["status"]) for one in log.entries(100)]
     assert found[::-1] == [
         ("Asha", "sign-in", "", None, "403"),
@@ -306,6 +360,7 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
         ("Asha", "capture", visit, None, "409"),
         ("", "view", visit, None, "401"),
     ]
+    assert {one.more["clock"] for one in log.entries(100)} == {"not_set"}
     assert b"Meena" not in (tmp_path / "audit-log.jsonl").read_bytes()
     shown = ask(app, "GET", "/api/audit?action=sign-in", token).json()
     assert ([entry["number"] for entry in shown["entries"]], shown["problem"]) == ([2, 1], None)

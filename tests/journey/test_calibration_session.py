@@ -62,7 +62,7 @@ class Station:
             transport = httpx.ASGITransport(app=self.app)
             async with httpx.AsyncClient(
                 transport=transport,
-                base_url="http://eye.local",
+                base_url="http://diffuscope.local",
                 cookies=self.cookies,
                 headers={"X-Controller": "test"},
             ) as client:

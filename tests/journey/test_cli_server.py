@@ -4,6 +4,7 @@ import http.client
 import json
 import signal
 import socket
+import ssl
 import subprocess
 import time
 import urllib.request
@@ -14,8 +15,14 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import pytest
 import tifffile
 
+from device.clock import SystemClock
+from device.errors import InputError
+from services.http.server import Certificate, bind_socket, require_protection
+from services.identity.certificates import create_authority, create_server_certificate
+from services.identity.users import ROLES, UserTable
 from tests.journey.conftest import COMMAND, ROOT, Diffuscope
 
 
@@ -30,6 +37,7 @@ class Server:
         self._command += more
         self._log = data.with_suffix(".log")
         self._environment = environment
+        self.trusted: ssl.SSLContext | None = None  # of a page that is served by TLS
 
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[bytes]]:
@@ -58,10 +66,9 @@ class Server:
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(
-            f"http://127.0.0.1:{self.port}{path}", data, {"Content-Type": "application/json"}, method=method
-        )
-        with urllib.request.urlopen(request, timeout=90) as answer:
+        url = f"{'http' if self.trusted is None else 'https'}://127.0.0.1:{self.port}{path}"
+        request = urllib.request.Request(url, data, {"Content-Type": "application/json"}, method=method)
+        with urllib.request.urlopen(request, timeout=90, context=self.trusted) as answer:
             content = answer.read()
         return json.loads(content) if answer.headers["content-type"] == "application/json" else content
 
@@ -144,3 +151,36 @@ def test_a_data_folder_of_a_version_before_the_first_release_is_refused_before_t
     assert "Give another folder with --data" in done.stderr
     assert "Traceback" not in done.stderr
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["shelf.sqlite"]
+
+
+def test_an_address_beyond_this_computer_needs_a_user_and_tls(tmp_path: Path) -> None:
+    """Socket and table of the users decide, before any part of a head is opened."""
+    users, certificate = UserTable(tmp_path), Certificate(tmp_path / "crt.pem", tmp_path / "key.pem")
+    with bind_socket("127.0.0.1", 0) as own, bind_socket("0.0.0.0", 0) as open_to_all:
+        for tls in (None, certificate):
+            require_protection(own, users, tls)
+            with pytest.raises(InputError, match="no user exists yet") as refusal:
+                require_protection(open_to_all, users, tls)
+            assert "users add" in refusal.value.remedy
+        users.add("Asha", "274913", ROLES)
+        with pytest.raises(InputError, match="no certificate"):
+            require_protection(open_to_all, users, None)
+        require_protection(open_to_all, users, certificate)
+
+
+def test_the_page_is_served_by_tls_with_given_files(
+    served_head: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    authority = create_authority("eye", SystemClock())
+    for name, content in zip(
+        ("key.pem", "crt.pem"), create_server_certificate(*authority, "eye", SystemClock()), strict=True
+    ):
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "authority.pem").write_bytes(authority[1])
+    words = ("--certificate", str(tmp_path / "crt.pem"), "--certificate-key", str(tmp_path / "key.pem"))
+    server = Server(served_head, tmp_path / "data", environment, *words)
+    server.trusted = ssl.create_default_context(cafile=str(tmp_path / "authority.pem"))
+    server.trusted.check_hostname = False  # the names of the certificate are those of a device
+    with server.running():
+        assert server.ask("GET", "/api/login")["user"]["is_demo"]
+        assert "Open https://127.0.0.1" in server.output()

@@ -22,7 +22,7 @@ OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
 def client_of(app: Any, host: str) -> httpx.AsyncClient:
     """Return a client of an application in this process, at the given address."""
     transport = httpx.ASGITransport(app=app, client=(host, 50000))
-    return httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30, headers=OWN_PAGE)
+    return httpx.AsyncClient(transport=transport, base_url="http://diffuscope.local", timeout=30, headers=OWN_PAGE)
 
 
 def test_more_event_streams_than_permitted_are_refused_until_one_ends(rig: Rig) -> None:

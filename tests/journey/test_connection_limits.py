@@ -152,12 +152,26 @@ def test_a_new_connection_is_refused_while_all_are_answered() -> None:
         assert [answer_on(connection) for connection in busy] == [b"0", b"0"]
 
 
-def test_a_tls_port_and_a_plain_port_share_one_limit(tmp_path: Path) -> None:
+@pytest.fixture
+def tls(tmp_path: Path) -> dict[str, Path]:
+    """uvicorn's options of TLS with a certificate of `authority.pem`."""
     authority = create_authority("eye", SystemClock())
     key, certificate = create_server_certificate(*authority, "eye", SystemClock())
     for name, content in (("key.pem", key), ("crt.pem", certificate), ("authority.pem", authority[1])):
         (tmp_path / name).write_bytes(content)
-    tls = {"ssl_keyfile": tmp_path / "key.pem", "ssl_certfile": tmp_path / "crt.pem"}
+    return {"ssl_keyfile": tmp_path / "key.pem", "ssl_certfile": tmp_path / "crt.pem"}
+
+
+def test_connections_without_a_tls_handshake_are_limited_as_others(tls: dict[str, Path]) -> None:
+    limits = ConnectionLimits(ClientLimits(local=4, remote=4, per_address=4), header_timeout_s=1.0)
+    with served(App(), limits, tls) as (port,), ExitStack() as undo:
+        first, *idle = [undo.enter_context(closing(connected(port))) for _ in range(5)]
+        first.settimeout(0.5)
+        assert is_closed(first)  # the fifth took its place, before any time-out
+        assert all(is_closed(connection) for connection in idle)
+
+
+def test_a_tls_port_and_a_plain_port_share_one_limit(tls: dict[str, Path], tmp_path: Path) -> None:
     trusted = ssl.create_default_context(cafile=str(tmp_path / "authority.pem"))
     app, limits = App(), ConnectionLimits(ClientLimits(local=3, remote=3, per_address=3))
     with served(app, limits, tls, {}) as (secure, plain), ExitStack() as undo:

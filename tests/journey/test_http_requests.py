@@ -73,7 +73,7 @@ def test_a_chunked_body_below_the_limit_is_read(rig: Any) -> None:
         ("::", "http://[::]:8000"),
         ("fe80::1%eth0", "http://[fe80::1%eth0]:8000"),
         ("127.0.0.1", "http://127.0.0.1:8000"),
-        ("eye.local", "http://eye.local:8000"),
+        ("diffuscope.local", "http://diffuscope.local:8000"),
     ],
 )
 def test_the_printed_address_opens(host: str, url: str) -> None:

@@ -81,7 +81,7 @@ def test_a_finished_visit_is_named_by_its_number_and_never_by_its_id(rig: Any) -
     for path, body in (
         ("/api/captures", press),
         (f"/api/visits/{visit['id']}/not-possible", {"key": next(keys), "slot": "R-centre", "reason": "lids"}),
-        (f"/api/visits/{visit['id']}/reopen", {"key": next(keys)}),
+        (f"/api/visits/{visit['id']}/reopen", {"key": next(keys), "reason": "picture"}),
     ):
         answer = rig.request("POST", path, json=body)
         assert answer.status_code == 409

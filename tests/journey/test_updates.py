@@ -67,7 +67,9 @@ def page(rig: Rig, tmp_path: Path) -> Page:
     board, clock = Board.new(tmp_path / "board"), VirtualClock()
     desk = UpdateRequests(board.state, board.requests, clock, "1.0")
     routers = (update_routes(desk),)
-    build = partial(create_app, rig.arbiter, rig.authenticator, host_names=("eye.local",), technician_routers=routers)
+    build = partial(
+        create_app, rig.arbiter, rig.authenticator, host_names=("diffuscope.local",), technician_routers=routers
+    )
     new = replace(rig, build_application=build)
     return Page(new, board, clock)
 
@@ -243,7 +245,7 @@ def test_full_disk_and_a_concurrent_upload_are_refused(page: Page) -> None:
             yield b"whole"
 
         transport = httpx.ASGITransport(app=page.rig.app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://eye.local") as client:
+        async with httpx.AsyncClient(transport=transport, base_url="http://diffuscope.local") as client:
             headers = {"Content-Length": "5"}
             first = asyncio.create_task(client.put("/api/update/file", content=slowly(), headers=headers))
             await begun.wait()
@@ -264,7 +266,7 @@ def test_computer_without_updater_refuses_updates(rig: Rig, page: Page, tmp_path
         page.rig.application = create_app(
             rig.arbiter,
             rig.authenticator,
-            host_names=("eye.local",),
+            host_names=("diffuscope.local",),
             technician_routers=(update_routes(desk),),
         )
         assert (page.status()["here"], page.status()["state"]) == (False, "none")

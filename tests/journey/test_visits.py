@@ -3,12 +3,14 @@
 import asyncio
 import json
 from itertools import count
+from socket import gethostname
 from typing import Any
 
 import httpx
 import pytest
 
 from device.sim import calibration_targets
+from services.http.security import is_trusted_host
 from services.instrument.exam_requests import WANTED_S
 from tests.journey.asking import record_answer
 from tests.journey.conftest import until
@@ -187,14 +189,35 @@ def test_a_finish_can_be_undone_on_the_same_day_of_the_instruments_clock(old_rig
     refused(patch(old_rig, visit, "age", 5), 409, "visit.finished")
     press = {"key": next(keys), "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
     refused(old_rig.request("POST", "/api/captures", json=press), 409, "visit.finished")
-    opened = post(old_rig, f"/api/visits/{visit['id']}/reopen")
+    opened = post(old_rig, f"/api/visits/{visit['id']}/reopen", reason="answer")
     assert opened["finished_at"] is opened["outcome"] is opened["undo_until"] is None
     assert patch(old_rig, visit, "age", 5).status_code == 200
     assert post(old_rig, f"/api/visits/{visit['id']}/finish")["undo_until"]
     old_rig.clock.elapsed_s += 86400
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["undo_until"] is None
-    late = old_rig.request("POST", f"/api/visits/{visit['id']}/reopen", json={"key": next(keys)})
+    late = old_rig.request("POST", f"/api/visits/{visit['id']}/reopen", json={"key": next(keys), "reason": "answer"})
     refused(late, 409, "visit.finished")
+
+
+def test_the_history_of_a_visit_keeps_what_was_who_changed_it_and_why(old_rig: Any) -> None:
+    visit = begin(old_rig)
+    at = f"/api/visits/{visit['id']}"
+    for field, value in (("vision_od", "6/60"), ("vision_od", "6/6"), ("vision_od", "6/6"), ("name", "Meena")):
+        assert patch(old_rig, visit, field, value).status_code == 200
+    post(old_rig, f"{at}/finish")
+    without_reason = old_rig.request("POST", f"{at}/reopen", json={"key": next(keys)})
+    assert without_reason.status_code == 422
+    assert old_rig.request("GET", at).json()["finished_at"] is not None
+    post(old_rig, f"{at}/reopen", reason="answer")
+    changes = old_rig.request("GET", f"{at}/changes").json()["changes"]
+    assert [(one["number"], one["user"], one["field"], one["was"], one["value"], one["why"]) for one in changes] == [
+        (1, "Demo", "vision_od", None, "6/60", None),
+        (2, "Demo", "vision_od", "6/60", "6/6", None),
+        (3, "Demo", "outcome", None, "refer_picture", None),
+        (4, "Demo", "outcome", "refer_picture", None, "answer"),
+    ]
+    assert [one["at"] for one in changes] == sorted(one["at"] for one in changes)
+    assert old_rig.request("GET", "/api/visits/none/changes").status_code == 404
 
 
 def test_a_known_number_is_the_same_patient_with_or_without_the_prefix(old_rig: Any) -> None:
@@ -303,11 +326,11 @@ def test_every_form_field_stores_and_returns_its_answers(old_rig: Any) -> None:
     left = dict.fromkeys(answers.keys() - {"name", "phone", "village"})  # identifying fields are removed completely
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"] == left
     assert post(old_rig, f"/api/visits/{visit['id']}/finish")["outcome"]["code"] == "refer_picture"
-    post(old_rig, f"/api/visits/{visit['id']}/reopen")
+    post(old_rig, f"/api/visits/{visit['id']}/reopen", reason="answer")
     for urgent in ("sudden_loss", "pain"):
         patch(old_rig, visit, "complaints", [urgent])
         assert post(old_rig, f"/api/visits/{visit['id']}/finish")["outcome"]["code"] == "refer_today"
-        post(old_rig, f"/api/visits/{visit['id']}/reopen")
+        post(old_rig, f"/api/visits/{visit['id']}/reopen", reason="answer")
 
 
 @pytest.mark.parametrize("number", ["x" * 21, "../a", "a b", "", "\ud800", "<b>", "A00012", "٣٤"])
@@ -398,7 +421,7 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "origin", ["http://evil.example", "null", "http://eye.local:81", "https://[", "http://eye.localx"]
+    "origin", ["http://evil.example", "null", "http://diffuscope.local:81", "https://[", "http://diffuscope.localx"]
 )
 def test_a_cross_origin_change_is_403(old_rig: Any, origin: str) -> None:
     before = old_rig.request("GET", "/api/visits").json()
@@ -407,7 +430,7 @@ def test_a_cross_origin_change_is_403(old_rig: Any, origin: str) -> None:
         refused(answer, 403, "link.forged")
         assert "default-src 'none'" in answer.headers["content-security-policy"]
     assert old_rig.request("GET", "/api/visits").json() == before
-    own = {"Origin": "http://eye.local"}
+    own = {"Origin": "http://diffuscope.local"}
     assert old_rig.request("POST", "/api/visits", json={"key": next(keys)}, headers=own).status_code == 201
 
 
@@ -415,19 +438,31 @@ def test_untrusted_host_names_are_refused(old_rig: Any) -> None:
     def status(host: str) -> int:
         return int(old_rig.request("GET", "/api/health", headers={"Host": host}).status_code)
 
-    own = ["10.42.0.1", "10.42.0.1:8000", "[::1]:8000", "localhost:8000", "eye.local", "EYE.LOCAL", "eye.local:80"]
+    own = ["127.0.0.1:8000", "[::1]:8000", "localhost:8000", "diffuscope.local", "DIFFUSCOPE.LOCAL:80"]
+    own.append(f"{gethostname()}.local")
     assert {host: status(host) for host in own} == dict.fromkeys(own, 200)
     foreign = [
         "evil.example",
-        "eye.local.evil.example",
+        "diffuscope.local.evil.example",
         "localhost.evil.example",
-        "eye.local:x",
+        "diffuscope.local:x",
         "[",
+        "other.local",
+        "10.42.0.1",
+        "8.8.8.8",
         "10.42.0.1.evil",
         "",
     ]
     assert {host: status(host) for host in foreign} == dict.fromkeys(foreign, 400)
     refused(old_rig.request("GET", "/", headers={"Host": "evil.example"}), 400, "link.host")
+
+
+@pytest.mark.parametrize("address", ["10.42.0.1", "::ffff:10.42.0.1"])
+def test_the_address_that_a_connection_came_to_is_a_name(address: str) -> None:
+    """No other one: the address of a router that forwards a port is no name of the device."""
+    assert is_trusted_host("10.42.0.1:8000", frozenset(), address)
+    assert not is_trusted_host("10.42.0.2:8000", frozenset(), address)
+    assert not is_trusted_host("10.42.0.1", frozenset(), "/run/socket")
 
 
 def test_many_tabs_at_once_get_different_numbers(old_rig: Any) -> None:

@@ -12,7 +12,7 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import StoreFull
 from services.backup import store_contents
-from services.backup.backup_folder import BackupFolder, find_folder
+from services.backup.backup_folder import BackupFolder, backup_path, find_folder
 from services.backup.backup_key import (
     HEADER_FILES,
     KEY_FILE,
@@ -34,14 +34,10 @@ from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from tests.store_damage import FILES, expected, filled_store, shown
 
-
-def secret_key() -> SecretKey:
-    """Return a new secret key of age."""
-    return SecretKey(str(pyrage.x25519.Identity.generate()))
-
-
-SECRET = secret_key()
-RECIPIENT = SECRET.public_key
+IDENTITY = pyrage.x25519.Identity.generate()
+RECIPIENT = str(IDENTITY.to_public())
+KEY = key_for_recipients([RECIPIENT])
+SECRET = SecretKey(str(IDENTITY), KEY.secret)
 CLOCK = VirtualClock()
 
 
@@ -51,7 +47,12 @@ def quiet(done: int, total: int) -> None:
 
 @pytest.fixture
 def key() -> BackupKey:
-    return key_for_recipients([RECIPIENT])
+    return KEY
+
+
+def secret_key() -> SecretKey:
+    """Return a new secret key of age."""
+    return SecretKey(str(pyrage.x25519.Identity.generate()), KEY.secret)
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_nothing_on_the_stick_is_readable_without_the_key(store: Path, stick: Pa
         assert secret in b"".join(path.read_bytes() for path in store.rglob("*") if path.is_file())
         assert secret not in everything
     assert "2026-1-OD" not in names
-    assert key.naming_secret.encode() not in everything
+    assert key.secret.encode() not in everything
     with pytest.raises(BackupKeyWrong, match="not that of these backups"):
         restore_backup(find_folder(stick), secret_key(), stick / "new", quiet)
 
@@ -163,10 +164,12 @@ def test_a_file_without_a_secret_key_is_refused(tmp_path: Path) -> None:
     (tmp_path / "key").write_text("# created by age-keygen\n")
     for path in (tmp_path / "key", tmp_path / "missing"):
         with pytest.raises(BackupKeyWrong, match=path.name):
-            key_in(path)
-    identity = pyrage.x25519.Identity.generate()
-    (tmp_path / "key").write_text(f"# created by age-keygen\n{identity}\n")
-    assert key_in(tmp_path / "key").public_key == str(identity.to_public())
+            key_in(path, KEY.header)
+    (tmp_path / "key").write_text(f"# created by age-keygen\n{IDENTITY}\n{key_for_recipients([RECIPIENT]).line}\n")
+    with pytest.raises(BackupKeyWrong, match=f"begins with '# diffuscope backups {KEY.header.id}'"):
+        key_in(tmp_path / "key", KEY.header)
+    (tmp_path / "key").write_text(f"# created by age-keygen\n{IDENTITY}\n{KEY.line}\n")
+    assert key_in(tmp_path / "key", KEY.header).opened(KEY.header.encrypted(KEY.sealed(b"content"))) == b"content"
 
 
 def test_a_backup_needs_a_key(store: Path, stick: Path) -> None:
@@ -278,6 +281,41 @@ def test_an_older_backup_is_used_if_the_newest_is_damaged(
         restored_from(stick, tmp_path / "third", 7)
 
 
+def test_a_backup_that_another_made_with_the_public_key_is_refused(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    """The stick names the public key, so that its finder can encrypt records of its own; only the device can seal."""
+    write_backup(store, stick, CLOCK, quiet, key)
+    folder = find_folder(stick)
+    (stick / "foreign").mkdir()
+    foreign = BackupKey(header=read_header(folder), secret="0" * 64)
+    write_backup(filled_store(tmp_path / "foreign", with_log=True), stick / "foreign", CLOCK, quiet, foreign)
+    forged = next((stick / "foreign").rglob("backups/*.age"))
+    for path in (stick / "foreign").rglob("objects/*"):
+        shutil.copy(path, folder / "objects")
+    for number, source in ((999_999, forged), (999_998, backup_path(folder, 1))):
+        shutil.copy(source, backup_path(folder, number))
+    shutil.rmtree(stick / "foreign")
+    result = restored_from(stick, tmp_path / "new")
+    assert (result.number, result.damaged_backups) == (1, (999_999, 999_998))
+    assert shown(tmp_path / "new") == (expected(store), 0)
+    with pytest.raises(BackupDamaged):
+        restored_from(stick, tmp_path / "2", 999_999)
+
+
+def test_a_forged_index_puts_no_object_into_the_next_backup(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    index = next(stick.rglob("index.txt"))
+    names = [line.split() for line in index.read_text().splitlines() if line]
+    swapped = [f"{a[0]} {' '.join(b[1:])}" for a, b in zip(names, names[1:] + names[:1], strict=True)]
+    index.write_text("\n".join(swapped))
+    write_backup(store, stick, CLOCK, quiet)
+    assert restored_from(stick, tmp_path / "new").damaged_units == ()
+    assert shown(tmp_path / "new") == (expected(store), 0)
+
+
 def test_a_torn_index_costs_a_copy_and_no_backup(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
     before = expected(store)
     write_backup(store, stick, CLOCK, quiet, key)
@@ -375,7 +413,7 @@ def test_folders_that_hold_no_backup_are_named(stick: Path) -> None:
     with pytest.raises(BackupDamaged, match="none"):
         find_folder(stick)
     for number in range(2):
-        BackupFolder(stick, key_for_recipients([RECIPIENT]).header)
+        BackupFolder(stick, key_for_recipients([RECIPIENT]))
         assert len(list(stick.iterdir())) == number + 1
     with pytest.raises(BackupDamaged, match="diffuscope-backup-"):
         find_folder(stick)

@@ -1,4 +1,4 @@
-"""Time of a tablet: taken once, where nothing better is there, and recorded."""
+"""Time of a tablet: accepted once, where nothing better is there, forward but for an administrator, and recorded."""
 
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 
 from device.clock import VirtualClock
-from services.health.clock_request import REQUEST, offer_time, take_request
+from services.errors import ClockBackwards, ClockRefused
+from services.health.clock_request import REQUEST, needs_time, request_time, take_request
 from services.health.clock_source import clock_state
 
+CLOCK = VirtualClock(elapsed_s=60 * 86_400.0)
 NOW = datetime(2026, 11, 25, 9, 30, tzinfo=timezone(timedelta(hours=5, minutes=30)))
 
 
@@ -21,33 +23,54 @@ def root(tmp_path: Path) -> Path:
 
 def test_a_device_without_a_clock_takes_the_time_of_a_tablet_once(root: Path) -> None:
     taken: list[datetime] = []
-    assert offer_time(NOW, root)
-    assert "set by a tablet" in take_request(taken.append, VirtualClock(), root)
+    assert needs_time(root)
+    request_time(NOW, CLOCK, root=root)
+    assert "set by a tablet" in take_request(taken.append, CLOCK, root)
     assert taken == [NOW]
     assert clock_state(root) == "browser"
-    assert not offer_time(NOW + timedelta(hours=1), root), "a second tablet may be wrong"
+    assert not needs_time(root)
+    with pytest.raises(ClockRefused):  # a second tablet may be wrong
+        request_time(NOW + timedelta(hours=1), CLOCK, root=root)
     assert not (root / REQUEST).exists()
+
+
+def test_only_an_administrator_sets_the_clock_backwards_or_once_more(root: Path) -> None:
+    before = CLOCK.wall() - timedelta(hours=1)
+    with pytest.raises(ClockBackwards):
+        request_time(before, CLOCK, root=root)
+    taken: list[datetime] = []
+    for now in (before, NOW, before):
+        request_time(now, CLOCK, by_administrator=True, root=root)
+        assert "set by a tablet" in take_request(taken.append, CLOCK, root)
+    assert taken == [before, NOW, before]
+    (root / REQUEST).write_text(before.isoformat())  # written past the page
+    assert "not needed" in take_request(lambda _: pytest.fail("the clock was set"), CLOCK, root)
 
 
 def test_the_network_is_better_than_a_tablet(root: Path) -> None:
     """Also if it answers between the offer and the setting."""
-    assert offer_time(NOW, root)
+    request_time(NOW, CLOCK, root=root)
     (root / "run/systemd/timesync").mkdir(parents=True)
     (root / "run/systemd/timesync/synchronized").touch()
     taken: list[datetime] = []
-    assert "not needed" in take_request(taken.append, VirtualClock(), root)
+    assert "not needed" in take_request(taken.append, CLOCK, root)
     assert not taken
     assert clock_state(root) == "network"
-    assert not offer_time(NOW, root)
+    for by_administrator in (False, True):
+        with pytest.raises(ClockRefused):
+            request_time(NOW, CLOCK, by_administrator, root)
 
 
 @pytest.mark.parametrize("year", [1970, 2025, 2060, 9999])
 def test_an_impossible_date_is_not_offered(root: Path, year: int) -> None:
-    assert not offer_time(datetime(year, 1, 1, tzinfo=UTC), root)
+    with pytest.raises(ClockRefused):
+        request_time(datetime(year, 1, 1, tzinfo=UTC), CLOCK, by_administrator=True, root=root)
 
 
 def test_a_computer_without_the_unit_is_left_alone(tmp_path: Path) -> None:
-    assert not offer_time(NOW, tmp_path)
+    assert not needs_time(tmp_path)
+    with pytest.raises(ClockRefused):
+        request_time(NOW, CLOCK, root=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -42,6 +42,7 @@ TABLES = {
     "files": ("capture_id", "name", "sha256"),
     "visits": ("id", "patient", "day", "begun_at", "finished_at", "outcome"),
     "answers": ("visit", "name", "value"),
+    "changes": ("visit", "at", "user", "field", "was", "value"),
     "identifiers": ("patient", "name", "value"),
     "capture_slots": ("capture", "visit", "slot"),
     "slot_decisions": ("visit", "slot", "capture"),
@@ -68,8 +69,8 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         for number in range(3):
             visit = people.begin(next(keys)).id
-            people.answer(next(keys), visit, "consent", "agreed")
-            people.answer(next(keys), visit, "complaints", ["flashes", "red"])
+            people.answer(next(keys), visit, "consent", "agreed", "Screener")
+            people.answer(next(keys), visit, "complaints", ["flashes", "red"], "Screener")
             people.answer(next(keys), visit, "name", f"Name{number}")
             target = people.pictures.capture_target("OD", next(keys), visit, "R-centre")
             report = CaptureReport.read(REPORT | {"visit": visit, "slot": "R-centre"})
@@ -77,7 +78,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
             store.save(taken, FILES, target.write_rows)
             people.pictures.accept_capture(next(keys), f"c{number}")
             if number:
-                people.finish(next(keys), visit)
+                people.finish(next(keys), visit, "Screener")
             light.reserve(("OD",), 0.001, 10.0)
             clock.sleep(1)
         UploadQueue(store.engine, clock).record_failure(

@@ -30,7 +30,9 @@ from tests.project_files import ROOT
 
 MESSAGE = "was written by a version before the first release, which cannot be read here"
 CLOCK = VirtualClock()
-SECRET = SecretKey(str(pyrage.x25519.Identity.generate()))
+IDENTITY = pyrage.x25519.Identity.generate()
+KEY = key_for_recipients([str(IDENTITY.to_public())])
+SECRET = SecretKey(str(IDENTITY), KEY.secret)
 
 
 def tables(database: Path, revision: str = "r0006") -> sqlite3.Connection:
@@ -93,7 +95,7 @@ def lit(folder: Path, _: Path) -> None:
 
 
 def backed_up(folder: Path, place: Path) -> None:
-    write_backup(folder, place, CLOCK, lambda *_: None, key_for_recipients([SECRET.public_key]))
+    write_backup(folder, place, CLOCK, lambda *_: None, KEY)
 
 
 ACTIONS: list[Callable[[Path, Path], object]] = [
@@ -144,12 +146,11 @@ def test_an_earlier_snapshot_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["shelf.sqlite", schema.DATABASE])
 def test_an_earlier_backup_is_refused(tmp_path: Path, name: str) -> None:
-    key = key_for_recipients([SECRET.public_key])
     with_tables("old.sqlite")(tmp_path)
     manifest = Manifest(number=1, made_at=CLOCK.wall(), units={})
     files = {MANIFEST: manifest.model_dump_json().encode(), name: tmp_path / "old.sqlite"}
-    backups = BackupFolder(tmp_path, key.header)
-    backups.add_backup(1, key.header.encrypted(packed(files)))
+    backups = BackupFolder(tmp_path, KEY)
+    backups.add_backup(1, KEY.header.encrypted(KEY.sealed(packed(files))))
     with pytest.raises(StoreError, match=MESSAGE):
         restore_backup(find_folder(tmp_path), SECRET, tmp_path / "new", lambda *_: None)
     with CaptureStore(tmp_path / "new", reserve_bytes=0) as store:

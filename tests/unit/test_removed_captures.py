@@ -152,6 +152,6 @@ def test_a_finished_visit_is_removable_once_it_was_sent_or_exported(tmp_path: Pa
         with pytest.raises(RecordRemoved, match="exported"):
             store.read("c1", "picture.png")
         assert store.read("c2", "picture.png") == FILES["picture.png"]
-        people.reopen(next(keys), finished[1].id)
+        people.reopen(next(keys), finished[1].id, "picture")
         assert removal.undo() == 2
         assert removal.removable().captures == {"exported": [], "sent": ["c0"]}, "reopened: another state"

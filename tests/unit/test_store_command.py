@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from device.errors import StoreError
+from services.backup.store_command import app
 from services.errors import RecordNotFound, StoreDamaged
 from services.records.capture_store import CaptureStore
-from services.records.store_command import app
 from tests.store_damage import Shown, expected, filled_store, shown
 
 CHECKED = ("database", "copy of the dose ledger", "patients", "visits", "captures", "files of captures")

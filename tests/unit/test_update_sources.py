@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator
+from datetime import date, timedelta
 from pathlib import Path
 
 import pytest
@@ -18,14 +19,17 @@ from services.errors import (
     UpdateNoRoom,
     UpdateNotFound,
     UpdateOlder,
+    UpdateStale,
     UpdateUnreachable,
     UpdateUntrusted,
     UpdateWrongDevice,
 )
-from services.update.channel import Offer, verify_channel
+from services.update.available_updates import AvailableUpdates
+from services.update.channel import Offer, refuse_stale, verify_channel
 from services.update.preconditions import parse_version, refuse_unsuitable
-from services.update.rauc import Release
+from services.update.rauc import Rauc, Release
 from services.update.settings import UpdateSettings, load_settings
+from services.update.signers import bundle_certificates, refuse_other_purpose, refuse_revoked
 from services.update.sources import BACKOFF_S, UpdateServer, find_bundle
 from services.update.state import StateFile
 from tests.project_files import ROOT
@@ -46,6 +50,9 @@ def site(keys: Path) -> Iterator[Site]:
         yield site
 
 
+LAST_DAY = date(2026, 12, 31)
+
+
 def offer(content: bytes, version: str = "2.0") -> Offer:
     return Offer(
         compatible="diffuscope-pi5",
@@ -53,6 +60,8 @@ def offer(content: bytes, version: str = "2.0") -> Offer:
         bundle="two.raucb",
         bytes=len(content),
         sha256=hashlib.sha256(content).hexdigest(),
+        number=7,
+        expires=LAST_DAY,
     )
 
 
@@ -123,7 +132,7 @@ def test_missing_file_is_an_error_with_its_url(site: Site, keys: Path) -> None:
 
 
 def test_channel_is_accepted_with_a_valid_signature_only(keys: Path, tmp_path: Path) -> None:
-    fields = offer(CONTENT).model_dump() | {"of a later release": 1}
+    fields = offer(CONTENT).model_dump(mode="json") | {"of a later release": 1}
     channel = signed(keys, json.dumps(fields).encode())
     assert verify_channel(channel, keys / "ca.crt") == offer(CONTENT)
     stranger = tmp_path / "stranger"
@@ -140,6 +149,67 @@ def test_channel_is_accepted_with_a_valid_signature_only(keys: Path, tmp_path: P
         verify_channel(signed(keys, b'{"version": "2.0"}'), keys / "ca.crt")
     with pytest.raises(UpdateDamaged):
         verify_channel(signed(keys, json.dumps(fields | {"bundle": "../../etc/x.raucb"}).encode()), keys / "ca.crt")
+
+
+def test_an_old_file_of_the_channel_is_refused() -> None:
+    for seen in (0, 6, 7):
+        refuse_stale(offer(CONTENT), seen, LAST_DAY)
+    with pytest.raises(UpdateStale, match="file 7, and this device has seen file 8"):
+        refuse_stale(offer(CONTENT), 8, LAST_DAY)
+    with pytest.raises(UpdateStale, match="until 2026-12-31, and today is 2027-01-01"):
+        refuse_stale(offer(CONTENT), 7, LAST_DAY + timedelta(days=1))
+
+
+def test_the_device_keeps_number_and_revoked_keys_of_the_channel(keys: Path, site: Site, tmp_path: Path) -> None:
+    settings = UpdateSettings(channel=site.url, authority=keys / "web.crt", keyring=keys / "ca.crt", folder=tmp_path)
+    state = StateFile(tmp_path)
+    available = AvailableUpdates(settings, VirtualClock(), Rauc(["no-such-rauc"]), "1.0", state)
+
+    def answer(number: int, *revoked: str) -> None:
+        fields = offer(CONTENT).model_dump(mode="json") | {
+            "number": number,
+            "revoked": revoked,
+            "expires": "9999-12-31",
+        }
+        site.files["channel.cms"] = signed(keys, json.dumps(fields).encode())
+        available.newer_offer()
+
+    answer(7, "a" * 64)
+    answer(8, "b" * 64)
+    with pytest.raises(UpdateStale):
+        answer(7)
+    assert (state.read().channel_number, state.read().revoked) == (8, ("a" * 64, "b" * 64))
+    answer(9, key_of(keys))
+    with pytest.raises(UpdateUntrusted, match="is revoked"):
+        answer(10)
+
+
+def key_of(keys: Path) -> str:
+    """Return the SHA-256 of the public key of the signer, as services/update/README.md describes."""
+    command = f"openssl x509 -in {keys}/signer.crt -pubkey -noout | openssl pkey -pubin -outform DER | sha256sum"
+    return subprocess.run(command, shell=True, check=True, capture_output=True, text=True).stdout[:64]
+
+
+def test_a_revoked_key_signs_neither_channel_nor_bundle(keys: Path, tmp_path: Path) -> None:
+    channel = signed(keys, json.dumps(offer(CONTENT).model_dump(mode="json")).encode())
+    verify_channel(channel, keys / "ca.crt", {"0" * 64})
+    with pytest.raises(UpdateUntrusted, match="is revoked"):
+        verify_channel(channel, keys / "ca.crt", {key_of(keys)})
+    bundle = tmp_path / "two.raucb"
+    bundle.write_bytes(CONTENT + channel + len(channel).to_bytes(8, "big"))  # a signature at its end, as of RAUC
+    refuse_revoked(bundle_certificates(bundle), {"0" * 64})
+    with pytest.raises(UpdateUntrusted, match="is revoked"):
+        refuse_revoked(bundle_certificates(bundle), {key_of(keys)})
+    for content in (b"", b"short", CONTENT, CONTENT + (1 << 40).to_bytes(8, "big")):
+        bundle.write_bytes(content)
+        refuse_revoked(bundle_certificates(bundle), {key_of(keys)})  # RAUC refuses it
+
+
+def test_a_channel_of_a_signer_for_another_purpose_is_refused(keys: Path) -> None:
+    """The authority of the image may have signed certificates for other uses too."""
+    with pytest.raises(UpdateUntrusted, match="may not sign code"):
+        refuse_other_purpose((keys / "ca.crt").read_bytes())
+    refuse_other_purpose((keys / "signer.crt").read_bytes())
 
 
 def test_versions_compare_as_numbers(tmp_path: Path) -> None:

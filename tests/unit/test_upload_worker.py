@@ -63,7 +63,7 @@ class QueueSetup:
         return self.finish(self.begin())
 
     def reopen(self, visit: str) -> None:
-        self.repository.reopen(next(keys), visit)
+        self.repository.reopen(next(keys), visit, "mistake")
 
     def take(self, visit: str, slot: str = "R-centre") -> None:
         self.clock.sleep(1)

@@ -183,7 +183,7 @@ function isSaidElsewhere(state, code) {
   return (state.route.screen === "send" && code.startsWith("send.")) || (code === "make.slow" && Boolean(capture?.verdict || capture?.over));
 }
 
-const ALERT_LINKS = { technician: "/technician", pin: "/technician", setClock: "/technician" };
+const ALERT_LINKS = { technician: "/technician", pin: "/technician" };
 
 export const alertButton = (alert, name, actions) =>
   ALERT_LINKS[name]

@@ -1,5 +1,5 @@
-// <user-login>: dialog over the whole page that asks for sign-in, for the set-up of a new device, or for the PIN once more.
-// What is behind it stays as it is; the event "login-changed" follows a login.
+// <user-login>: dialog over the whole page that asks for sign-in, for the set-up of a new device, for the PIN once more,
+// or for the own new PIN. What is behind it stays as it is; the event "login-changed" follows a login.
 
 import { icon } from "./icons.js";
 import { sentences } from "../core/api.js";
@@ -9,7 +9,13 @@ import { t } from "../i18n/translate.js";
 
 /** @typedef {{code: string, name: string, error: string, busy: boolean}} Asking */
 
-const PATHS = { "access.none": "/api/login", "access.setup": "/api/setup", "access.confirm": "/api/login/confirm" };
+const REQUESTS = {
+  "access.none": ["POST", "/api/login"],
+  "access.setup": ["POST", "/api/setup"],
+  "access.confirm": ["POST", "/api/login/confirm"],
+  own: ["PUT", "/api/login/secret"],
+};
+const HAS_CANCEL = ["access.confirm", "own"];
 
 class UserLogin extends HTMLElement {
   /** @type {Asking} */
@@ -53,10 +59,11 @@ class UserLogin extends HTMLElement {
       const form = event.target;
       const typed = /** @type {Record<string, string>} */ (Object.fromEntries(new FormData(form)));
       if (busy) return;
-      if (code === "access.setup" && typed.secret !== typed.again) return this.#set({ error: t("login.differ") });
+      if ("again" in typed && (typed.new ?? typed.secret) !== typed.again) return this.#set({ error: t("login.differ") });
       delete typed.again;
       this.#set({ busy: true, name: typed.name ?? this.#state.name });
-      const answer = await requestLogin("POST", PATHS[code], typed);
+      const [method, path] = REQUESTS[code];
+      const answer = await requestLogin(method, path, typed);
       form.elements.secret.value = "";
       if (answer?.user) return this.#done(answer.user);
       const error = answer?.message ? sentences(answer) : sentences({ message: t("link.cut"), remedy: t("link.cut.remedy") });
@@ -64,9 +71,9 @@ class UserLogin extends HTMLElement {
       form.elements.secret.focus();
     },
 
-    /** The dialog of a login cannot be closed by Escape; the question for the PIN once more can. */
+    /** The dialog of a login cannot be closed by Escape; the one of a user who is signed in can. */
     cancel: (event) => {
-      if (this.#state.code !== "access.confirm") return event.preventDefault();
+      if (!HAS_CANCEL.includes(this.#state.code)) return event.preventDefault();
       this.#set({ code: "", error: "", busy: false });
     },
   };
@@ -81,21 +88,24 @@ class UserLogin extends HTMLElement {
 
 customElements.define("user-login", UserLogin);
 
-const TITLES = { "access.setup": "login.setup", "access.confirm": "login.confirm" };
+const TITLES = { "access.setup": "login.setup", "access.confirm": "login.confirm", own: "login.own" };
 
 /** @param {Asking} state */
 function view({ code, name, error, busy }, actions) {
   const isSetup = code === "access.setup";
+  const isOwn = code === "own";
+  const hasCancel = HAS_CANCEL.includes(code);
   return html`<dialog class="login" aria-labelledby="login-title" @cancel=${actions.cancel}>
     <form @submit=${actions.submit} autocomplete="off">
       <h2 id="login-title">${icon("person")} ${t(TITLES[code] ?? "login.title")}</h2>
       ${isSetup ? html`<p>${t("login.setup.why")}</p>${field("code", t("login.code"))}` : nothing}
-      ${code === "access.confirm" ? nothing : names(name, isSetup ? [] : knownNames(), actions)}
-      ${field("secret", t(isSetup ? "login.new" : "login.pin"), "password")}
-      ${isSetup ? field("again", t("login.again"), "password") : nothing}
+      ${hasCancel ? nothing : names(name, isSetup ? [] : knownNames(), actions)}
+      ${field("secret", t(isSetup ? "login.new" : isOwn ? "login.old" : "login.pin"), "password")}
+      ${isOwn ? field("new", t("login.new"), "password") : nothing}
+      ${isSetup || isOwn ? field("again", t("login.again"), "password") : nothing}
       <p class="bad" role="alert">${error}</p>
-      <button class="primary" type="submit" aria-disabled=${busy}>${t(isSetup ? "login.create" : "login.open")}</button>
-      ${code === "access.confirm" ? html`<button type="button" @click=${({ target }) => target.closest("dialog").requestClose?.()}>${t("back")}</button>` : nothing}
+      <button class="primary" type="submit" aria-disabled=${busy}>${t(isSetup ? "login.create" : isOwn ? "login.own" : "login.open")}</button>
+      ${hasCancel ? html`<button type="button" @click=${({ target }) => target.closest("dialog").requestClose?.()}>${t("back")}</button>` : nothing}
     </form>
   </dialog>`;
 }

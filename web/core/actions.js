@@ -1,6 +1,6 @@
 // User actions by tap or key: one object of handlers that templates and keyboard share.
 
-import { fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
+import { acceptTime, fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
 import { get, otherEyeSlot, saveSetting, set, currentCapture } from "./state.js";
 import { applyKey, isNumber } from "./numbers.js";
@@ -9,7 +9,7 @@ import { qrCode } from "./qr_code.js";
 import { navigate } from "./router.js";
 import { dismissAlert, lowerAlert, lowerAlerts, raiseAlert } from "./alerts.js";
 import { previewActions } from "./aiming.js";
-import { lock } from "./login.js";
+import { changeSecret, lock } from "./login.js";
 import { aimByItself } from "./going_on.js";
 import { refreshStatus, setControl } from "./status.js";
 import * as visits from "./visit.js";
@@ -28,6 +28,7 @@ const goToAim = (slot) => navigate({ screen: "aim", visit: currentRoute().visit,
 const navigationActions = {
   go: navigate,
   lock,
+  changeSecret,
   begin: (number) => visits.begin(number),
   resume: visits.resume,
   retryUploads: visits.retryUploads,
@@ -92,7 +93,8 @@ const examActions = {
     set({ asking: "" });
     if (slot) goToAim(slot);
   },
-  reopen: () => visits.reopen(),
+  reopen: (reason) => visits.reopen(reason),
+  loadChanges: () => visits.loadChanges(),
   backToOutcome: () => navigate({ screen: "outcome", visit: currentRoute().visit }),
   moveToOtherEye: (slot, capture) => visits.moveToOtherEye(slot, capture),
   print: () => window.print(),
@@ -173,6 +175,12 @@ const alertButtons = {
   ok: ({ code }) => lowerAlert(code),
   later: dismissAlert,
   dateIsRight: dismissAlert,
+  timeIsRight: async (alert) => {
+    if (await visits.alertOnError(() => acceptTime())) dismissAlert(alert);
+  },
+  setClock: async (alert) => {
+    if (await visits.alertOnError(() => acceptTime("/back"))) dismissAlert(alert);
+  },
   retry: refreshStatus,
   useHere: async () => {
     const answer = await visits.alertOnError(() => requestControl(true));

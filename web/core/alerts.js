@@ -4,7 +4,7 @@
 
 import { sentences } from "./api.js";
 import { consentOf, get, lostCaptures, set } from "./state.js";
-import { calendarDay, has, t } from "../i18n/translate.js";
+import { calendarDay, clockTime, has, t } from "../i18n/translate.js";
 
 /** @typedef {import("../core/state.js").State} State */
 
@@ -38,6 +38,7 @@ const TABLE = [
   ["link.slow", "tell", []],
   ["batt.low", "tell", []],
   ["store.low", "tell", []],
+  ["clock.unset", "tell", ["timeIsRight", "later"]],
   ["clock.wrong", "tell", ["dateIsRight", "setClock"]],
   ["send.stuck", "tell", ["why", "tryNow"]],
   ["make.slow", "tell", ["next"]],
@@ -87,10 +88,13 @@ const UNKNOWN = { buttons: [], assertive: false };
  */
 export function alertText({ code, message, remedy, ...vars }) {
   const key = `state.${code}`;
-  const values = translatedValues(vars);
+  const values = { ...translatedValues(vars), ...(code === "clock.unset" && timeHere()) };
   if (has(key, values)) return t(key, values);
   return message ? sentences({ message, remedy }) : t("fault.unknown");
 }
+
+// Date and time of this screen, which the user accepts for a device that has none.
+const timeHere = (now = new Date().toISOString()) => ({ today: calendarDay(now), now: clockTime(now) });
 
 /** @type {(vars: {eye?: string, other?: string, slot?: string, [more: string]: any}) => Record<string, any>} */
 const translatedValues = ({ eye, other, slot, n, ...vars }) => ({

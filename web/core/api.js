@@ -60,6 +60,7 @@ async function requestJson(path, options = {}) {
 export const getStatus = () => requestJson("/api/status");
 export const getProgramme = () => requestJson("/api/programme");
 export const getVisit = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}`);
+export const getChanges = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}/changes`);
 const montageUrl = (visit, eye) => `/api/visits/${encodeURIComponent(visit)}/montage/${encodeURIComponent(eye)}`;
 export const getMontage = (visit, eye) => requestJson(montageUrl(visit, eye));
 export const montagePictureUrl = (visit, eye, digest) => `${montageUrl(visit, eye)}/picture.png?${digest}`;
@@ -89,12 +90,11 @@ export function send(method, path, { key = newIdempotencyKey(), ...body } = {}) 
   });
 }
 
-/**
- * Request or renew the control lease, which one page holds at a time; `take` takes it from another page. A device whose
- * clock is not set takes the time of this browser.
- */
-export const requestControl = (take) =>
-  send("POST", "/api/controller", { key: controllerKey(), now: new Date().toISOString(), ...(take && { take }) });
+/** Set the clock of the device to that of this screen; `how` "/back": backwards or once more, as an administrator. */
+export const acceptTime = (how = "") => send("POST", `/api/clock${how}`, { now: new Date().toISOString() });
+
+/** Request or renew the control lease, which one page holds at a time; `take` takes it from another page. */
+export const requestControl = (take) => send("POST", "/api/controller", { key: controllerKey(), ...(take && { take }) });
 
 /** Release the control lease when the page closes; a beacon is sent even after the page is gone. */
 export const releaseControl = () =>

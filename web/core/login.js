@@ -42,6 +42,11 @@ export async function lock() {
   await checkLogin();
 }
 
+/** Open the dialog in which the user changes the own PIN. */
+export function changeSecret() {
+  document.dispatchEvent(new CustomEvent("login-required", { detail: "own" }));
+}
+
 let activityMs = -ACTIVITY_MS;
 
 /** Report that the user touches the page, which delays the idle lock; polling does not. */

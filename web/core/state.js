@@ -68,7 +68,7 @@ const settings = Object.freeze({
  *   counts: {done: number, to_finish: number, referred: number, declined: number} | null, typed: string, listFilter: string,
  *   captures: readonly Capture[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
  *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: string, zoom: number, note: string,
- *   picked: readonly string[], compared: readonly CaptureRecord[], montages: Readonly<Record<string, any>>,
+ *   picked: readonly string[], compared: readonly CaptureRecord[], montages: Readonly<Record<string, any>>, changes: readonly any[],
  *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, uploadQueue: any,
  *   finishing: string | null, goesOnFrom: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
  *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
@@ -97,6 +97,7 @@ export const store = createStore(/** @type {State} */ ({
   note: "",
   picked: Object.freeze([]), // the two captures to compare
   compared: Object.freeze([]), // records of these two captures
+  changes: Object.freeze([]), // of the visit on the pictures screen
   montages: Object.freeze({}), // of the visit on the pictures screen, by eye
   folders: null, // USB drives for a copy
   zipped: false, // the browser was asked to save a ZIP file

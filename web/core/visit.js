@@ -1,7 +1,7 @@
 // Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
 
 import { today } from "../i18n/translate.js";
-import { newIdempotencyKey, getMontage, getUploadQueue, getVisit, getVisits, ApiError, send } from "./api.js";
+import { newIdempotencyKey, getChanges, getMontage, getUploadQueue, getVisit, getVisits, ApiError, send } from "./api.js";
 import { eyeOf, get, lostCaptures, missingPictures, otherEyeSlot, moveCapture, set, pendingCaptures } from "./state.js";
 import { navigate } from "./router.js";
 import { lowerAlert, raiseAlert, raiseRefusal } from "./alerts.js";
@@ -262,9 +262,16 @@ export function finishWhenComplete() {
   else finish({ isSure: true });
 }
 
-/** Reopen the finished visit. */
-export async function reopen() {
-  const visit = await change("reopen");
+/** Load the changes of the visit that is shown. */
+export async function loadChanges() {
+  const id = get().route.visit;
+  const answer = await alertOnError(() => getChanges(id));
+  if (answer && get().route.visit === id) set({ changes: Object.freeze(answer.changes) });
+}
+
+/** Reopen the finished visit; `reason` is one of the server's. */
+export async function reopen(reason) {
+  const visit = await change("reopen", { reason });
   if (visit) resume(visit);
 }
 

@@ -40,10 +40,17 @@ export function outcome(state, actions) {
   `;
 }
 
-/** Button that reopens a finished visit, as long as the server allows it. */
+const REASONS = ["answer", "picture", "mistake"];
+
+/** The reasons to reopen a finished visit, behind their button, as long as the server allows it. */
 export const reopenButton = ({ undo_until: allowed }, actions) =>
   allowed
-    ? html`<button type="button" id="reopen" @click=${actions.reopen}>${icon("again")} ${t("outcome.reopen")}</button>`
+    ? html`<details class="reopen">
+        <summary class="button" id="reopen">${icon("again")} ${t("outcome.reopen")}</summary>
+        <div class="choice" role="group" aria-label=${t("reopen.why")}>
+          ${REASONS.map((why) => html`<button type="button" data-reason=${why} @click=${() => actions.reopen(why)}><span>${t(`reopen.${why}`)}</span></button>`)}
+        </div>
+      </details>`
     : nothing;
 
 // The outcome is known only after the last capture; until then its progress is shown.

@@ -130,7 +130,10 @@ function menu({ theme, letters, auto, sound, status, user }, actions) {
         </dl>
       </details>
       ${user ? html`<p>${t(user.is_demo ? "login.demo" : "login.as", { name: user.name })}</p>` : nothing}
-      ${user && !user.is_demo ? html`<button type="button" id="lock" @click=${actions.lock}>${t("login.lock")}</button>` : nothing}
+      ${user && !user.is_demo
+        ? html`<button type="button" id="lock" @click=${actions.lock}>${t("login.lock")}</button>
+            <button type="button" id="own-secret" @click=${actions.changeSecret}>${t("login.own")}</button>`
+        : nothing}
       <a class="button" href="/technician">${t("menu.technician")}</a>
       <p class="muted">${t("app.name")} · ${status ? t("menu.version", { version: status.version }) : ""}</p>
       <button class="primary" type="button" @click=${actions.closeMenu}>${t("menu.close")}</button>

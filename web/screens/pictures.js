@@ -1,6 +1,7 @@
 // Pictures of one patient with their montages, and comparison of two of them with synchronised zoom. Loaded on demand.
 
 import { colourLink, finalPicture, montagePictureUrl, visitZipUrl } from "../core/api.js";
+import { visitChanges } from "../components/visit_changes.js";
 import { outcomeTexts, reopenButton } from "./outcome.js";
 import { icon } from "../components/icons.js";
 import { choice, slotLabel, thumb, whyGreen } from "../components/components.js";
@@ -34,7 +35,7 @@ export function pictures(state, actions) {
               ${t("home.continue", { number: displayNumber(visit.number) })}
             </button>`}
       </div>
-      ${taken.length ? exportControls(visit, state, actions) : nothing}
+      ${taken.length ? exportControls(visit, state, actions) : nothing} ${visitChanges(state, actions)}
     </section>
   `;
 }

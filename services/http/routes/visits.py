@@ -5,16 +5,18 @@ from datetime import date
 
 from fastapi import APIRouter, Query, Request
 
-from services.health.clock_request import offer_time
+from services.http.access import signed_in
 from services.http.control_lease import ControlLease
 from services.http.schemas.captures import LateralityCorrection
 from services.http.schemas.common import IdempotentRequest
 from services.http.schemas.visits import (
+    ChangeList,
     ControlRequest,
     FieldValue,
     LeaseAnswer,
     MissingPicture,
     NewVisit,
+    Reopening,
     SlotChoice,
     VisitCounts,
     VisitList,
@@ -71,6 +73,14 @@ def _read_router(repository: VisitRepository) -> APIRouter:
         """Return one visit; 404 for an unknown id, 500 if the stored visit is damaged."""
         return visit_answer(repository.get(id), repository)
 
+    @router.get("/api/visits/{id}/changes")
+    def changes(id: str) -> ChangeList:
+        """Return the history of a visit: answers, consent, outcome and laterality, with user, time, before and after.
+
+        404 for an unknown id, 500 if the stored visit is damaged.
+        """
+        return ChangeList(changes=repository.changes(id))
+
     return router
 
 
@@ -95,7 +105,9 @@ def _form_router(repository: VisitRepository) -> APIRouter:
         404 for an unknown visit, 409 for a finished one, 422 for an unknown field or an invalid value.
         """
         request.state.audit_field = order.field
-        return visit_answer(repository.answer(order.key, id, order.field, order.value), repository)
+        return visit_answer(
+            repository.answer(order.key, id, order.field, order.value, signed_in(request).name), repository
+        )
 
     return router
 
@@ -133,20 +145,20 @@ def _end_router(repository: VisitRepository, pending: PendingCaptures, finished:
     router = APIRouter()
 
     @router.post("/api/visits/{id}/finish")
-    def finish(id: str, order: IdempotentRequest) -> VisitDocument:
+    def finish(id: str, order: IdempotentRequest, request: Request) -> VisitDocument:
         """Finish a visit, once no capture of it is pending or after 60 s; a finished visit stays unchanged.
 
         Answers with the visit and its outcome; 404 for an unknown visit.
         """
         pending.wait(id)
-        visit = repository.finish(order.key, id)
+        visit = repository.finish(order.key, id, signed_in(request).name)
         finished()
         return visit_answer(visit, repository)
 
     @router.post("/api/visits/{id}/reopen")
-    def reopen(id: str, order: IdempotentRequest) -> VisitDocument:
-        """Reopen a finished visit on the day of its finish; 409 on a later day."""
-        return visit_answer(repository.reopen(order.key, id), repository)
+    def reopen(id: str, order: Reopening, request: Request) -> VisitDocument:
+        """Reopen a finished visit on the day of its finish, for a reason that its history keeps; 409 on a later day."""
+        return visit_answer(repository.reopen(order.key, id, order.reason, signed_in(request).name), repository)
 
     return router
 
@@ -156,14 +168,16 @@ def _laterality_router(repository: VisitRepository, lease: ControlLease) -> APIR
     router = APIRouter()
 
     @router.post("/api/captures/{id}/eye")
-    def correct_laterality(id: str, order: LateralityCorrection) -> VisitDocument:
+    def correct_laterality(id: str, order: LateralityCorrection, request: Request) -> VisitDocument:
         """Correct the laterality of a capture: move it to the slot of `eye` with the same field of view.
 
         If it already belongs to that eye, it stays in place. The report records the correction or confirmation, and the
         laterality is not questioned again. Answers with the visit; 404 for an unknown capture or one without a visit,
         409 for a finished visit, 422 if the programme has no such slot.
         """
-        return visit_answer(repository.pictures.correct_laterality(order.key, id, order.eye, lease.holder), repository)
+        user = signed_in(request).name
+        visit = repository.pictures.correct_laterality(order.key, id, order.eye, lease.holder, user)
+        return visit_answer(visit, repository)
 
     return router
 
@@ -178,8 +192,6 @@ def _lease_router(lease: ControlLease) -> APIRouter:
 
         Answers with the public name of the present or last holder (`lease`) and whether this screen holds it (`mine`).
         """
-        if asking.now is not None:
-            offer_time(asking.now)
         state = lease.release(asking.key) if asking.release else lease.acquire(asking.key, asking.take)
         return LeaseAnswer(lease=state.lease, mine=state.mine)
 

@@ -2,13 +2,14 @@
 
 from typing import Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import Field
 
 from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName
 from services.http.schemas.problems import ErrorText
 from services.instrument.visit_montage import MontageState
 from services.records.json_values import FormValue
-from services.records.visit_document import VisitDocument
+from services.records.visit import ReopenReason
+from services.records.visit_document import VisitChange, VisitDocument
 
 
 class NewVisit(IdempotentRequest):
@@ -38,16 +39,26 @@ class SlotChoice(IdempotentRequest):
     capture: RecordId | None
 
 
+class Reopening(IdempotentRequest):
+    """Request body: why a finished visit is opened again."""
+
+    reason: ReopenReason
+
+
+class ChangeList(ResponseBody):
+    """History of a visit, the first change first."""
+
+    changes: list[VisitChange]
+
+
 class ControlRequest(IdempotentRequest):
     """Request body of the control lease; `key` is the secret key of the screen.
 
-    `take` takes the lease from another screen, `release` lets it expire. `now`: time of the browser, which the device
-    takes if nothing else has set its clock.
+    `take` takes the lease from another screen, `release` lets it expire.
     """
 
     take: bool = False
     release: bool = False
-    now: AwareDatetime | None = None
 
 
 class LeaseAnswer(ResponseBody):

@@ -64,6 +64,21 @@ CREATE TABLE captures (
 )
  STRICT;
 
+CREATE TABLE changes (
+	visit TEXT NOT NULL, 
+	number INTEGER NOT NULL, 
+	at TEXT NOT NULL, 
+	user TEXT NOT NULL, 
+	field TEXT NOT NULL, 
+	was TEXT NOT NULL, 
+	value TEXT NOT NULL, 
+	why TEXT, 
+	PRIMARY KEY (visit, number), 
+	CONSTRAINT change_is_json CHECK (json_valid(was) AND json_valid(value)), 
+	FOREIGN KEY(visit) REFERENCES visits (id)
+)
+ STRICT;
+
 CREATE TABLE counters (
 	prefix TEXT NOT NULL, 
 	last INTEGER NOT NULL, 
@@ -193,6 +208,12 @@ CREATE TRIGGER answers_update AFTER UPDATE ON answers BEGIN UPDATE visits SET re
 CREATE TRIGGER captures_changed AFTER UPDATE OF eye, taken_at, simulated, calibration_id, report, request ON captures BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = NEW.id; END;
 
 CREATE TRIGGER captures_of_visit_changed AFTER UPDATE OF eye, report ON captures BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER changes_delete AFTER DELETE ON changes BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = OLD.visit; END;
+
+CREATE TRIGGER changes_insert AFTER INSERT ON changes BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER changes_update AFTER UPDATE ON changes BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
 
 CREATE TRIGGER files_delete AFTER DELETE ON files BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = OLD.capture_id; END;
 

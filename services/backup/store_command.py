@@ -1,0 +1,65 @@
+"""Command `diffuscope store check|rebuild`: check everything that is stored; rebuild the database from the files."""
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.identity.audit_key import find_audit_key
+from services.running_time import announced, announcing, say
+
+if TYPE_CHECKING:
+    from services.records.store_check import Checked
+
+app = typer.Typer(help="What is stored: check it, and rebuild the database from its files.", no_args_is_help=True)
+Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
+
+
+@app.command()
+@announced("checking what is stored")
+def check(
+    data: Data,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Read everything that is stored, change nothing, and name what is damaged; exit status 1 if something is."""
+    from services.records.store_check import check_store  # deferred: imports SQLAlchemy
+
+    results = check_store(data, lambda line: say(f"{line} ..."), find_audit_key(data))
+    typer.echo(json.dumps([asdict(result) for result in results], indent=1) if as_json else table(results))
+    if not all(result.is_whole for result in results):
+        sys.exit(1)
+
+
+@app.command()
+def rebuild(
+    data: Data,
+    sure: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Rebuild the database from the files of patients, visits and captures; stop the instrument first."""
+    from services.records.capture_store import CaptureStore  # deferred: imports SQLAlchemy
+    from services.records.recovery import rebuild_database
+    from services.records.storage_errors import storage_errors
+
+    if not sure:
+        typer.confirm(f"Rebuild the database of {data}?", abort=True)
+    with announcing("rebuilding the database"):
+        with storage_errors():
+            aside = rebuild_database(data)
+        with CaptureStore(data, key=find_audit_key(data)) as store:
+            report = store.recovery
+    counts = f"{len(report.patients)} patients, {len(report.visits)} visits and {len(report.adopted)} captures"
+    typer.echo(f"The database has {counts} from the files. The one before is in {aside}.")
+
+
+def table(results: list["Checked"]) -> str:
+    """Return the results as a table of text, followed by the names of what is not whole."""
+    lines = [f"{'':<26}{'whole':>8}{'healable':>10}{'damaged':>9}"]
+    lines += [
+        f"{result.name:<26}{result.whole:>8}{len(result.healable):>10}{len(result.damaged):>9}" for result in results
+    ]
+    lines += [f"healable by the next start: {result.name}: {name}" for result in results for name in result.healable]
+    lines += [f"damaged: {result.name}: {name}" for result in results for name in result.damaged]
+    return "\n".join(lines)
