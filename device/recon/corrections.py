@@ -216,13 +216,13 @@ class Corrections:
                 break
             tried.append(again)
             left = _trace(again.run, ghost)
+            is_ghost = not self._has_spots or _falls(whole, again, 1 - SPOT_GHOST_FALL * light.share)
             if abs(left) < GHOST_FALLS * whole_trace:
-                most = min(GHOST_BETTER, 1 - SPOT_GHOST_FALL * light.share) if self._has_spots else GHOST_BETTER
-                is_better = light.share >= MIN_GHOST and _falls(whole, again, most)
+                is_better = light.share >= MIN_GHOST and is_ghost and _falls(whole, again, GHOST_BETTER)
                 if not is_better or states_misfit(again.made.report.warnings):
                     break
                 return whole.choice(again, tried).with_correction(light.key, light.share, light.words)
-            if left >= before[1]:  # it is no ghost
+            if left >= before[1] or (left > 0 and not is_ghost):  # a share that is too large may raise the residual
                 break
             secant = (last - before[0]) / (before[1] - left)
             before, last = (last, left), min(max(last + left * secant, MIN_SHARE), MAX_SHARE)
