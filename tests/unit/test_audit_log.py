@@ -10,7 +10,7 @@ import pytest
 from device.clock import VirtualClock
 from services import cli
 from services.errors import StoreDamaged
-from services.identity.audit_key import load_or_create_audit_key, read_audit_key
+from services.identity.audit_key import FILES, load_or_create_audit_key, read_audit_key
 from services.records.audit_log import HEAD, LOG, AuditLog
 
 TRIALS = 1000
@@ -123,10 +123,19 @@ def test_a_log_without_its_key_is_damaged_and_the_key_is_made_once(tmp_path: Pat
     key = load_or_create_audit_key(tmp_path)
     assert load_or_create_audit_key(tmp_path) == read_audit_key(tmp_path) == key
     AuditLog(tmp_path, key, VirtualClock()).append("Asha", "view")
-    (tmp_path / "access/audit-key").write_bytes(key[:-1])
+    for path in (copies := [tmp_path / "access" / name for name in FILES]):
+        whole = path.read_bytes()
+        for damaged in (whole[:-1], whole.replace(b"a", b"b"), b""):
+            path.write_bytes(damaged)
+            assert read_audit_key(tmp_path) == key, "the other copy is enough"
+            assert load_or_create_audit_key(tmp_path) == key
+            assert path.read_bytes() == whole, "the copy is written again"
+    for path in copies:
+        path.write_bytes(b"")
     with pytest.raises(StoreDamaged, match="damaged"):
         load_or_create_audit_key(tmp_path)
-    (tmp_path / "access/audit-key").unlink()
+    for path in copies:
+        path.unlink()
     with pytest.raises(StoreDamaged, match="missing"):
         load_or_create_audit_key(tmp_path)
 
