@@ -38,13 +38,13 @@ BETTER = 0.9  # of the residual of the whole frame: by chance up to 0.97, dust a
 MAX_EXPLAINED = 1.2  # rms residual of a frame without its spots: 0.86 to 1.0
 DUST = (
     "Dark spots, {share:.1%} of the frame, were left out; the largest is at row {row}, column {col} of the sensor. "
-    "Clean sensor and diffuser; if they stay, measure the flat frame again."
+    "Clean the sensor and the optics before it; if they stay, measure the flat frame again."
 )
 LINES_SD_DPT = 25.0  # of M, J0 and J45 per share of the light: errors of 15 to 40 in frames of 1 and 3 %, two sensors
 PUPIL_SOLUTIONS = 4  # duration of search, planning and solution for a pupil, in solutions of the frame
 PUPIL_SD_DPT = 0.5  # of M, J0 and J45 per hidden share of the PSF: 10 frames of 4 pupils were off by up to 0.9 times it
 PUPIL = (
-    "The pupil hides {share:.0%} of the diffuser; the picture was made with the rest. "
+    "The pupil hides {share:.0%} of the light; the picture was made with the rest. "
     "Centre the head on the pupil, or wait until it is wider; take it again."
 )
 

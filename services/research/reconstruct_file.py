@@ -418,7 +418,7 @@ def judged(report: FileReport, default: FileReport) -> FileReport:
     if share:
         warnings.append(
             f"Spots on {share:.1%} of the frame are no part of the retina, and '{report.method}' does not leave them "
-            "out: use the default method. Clean sensor and diffuser."
+            "out: use the default method. Clean the sensor and the optics before it."
         )
     unexplained = share or states_misfit(doubtful)
     report = replace(report, warnings=tuple(dict.fromkeys((*warnings, *doubtful))))

@@ -20,6 +20,7 @@ from device.sim.plan import decide
 from device.sim.render import convolved_with_disc
 from device.values import Calibration, Geometry, Image, Psf, Sensor
 from services import resources
+from tests.lens_packing import random_packing
 from tests.paper.bench import Bench
 from tests.scenes import speckle
 
@@ -135,6 +136,9 @@ def test_calibration_finds_lenses_without_spot_gaps_and_centres_that_moved() -> 
     assert found(gaps).beside > GAP_LIGHT
     for spots, word in ((covered, "covered"), (found(gaps), "gaps"), (moved, "moved by")):
         assert [word in message for message in lens_messages(lens_figures(spots, lenses, before))] == [True]
+    assert "22" in " ".join(lens_messages(lens_figures(None, lenses, before)))  # too few spots to fit lenses to
+    other = random_packing(600.0, optics().iris_um, 3)
+    assert shift_um(good.places_um, other) > 30  # another plate
 
 
 def test_spots_of_a_wider_point_source_than_stated_are_told_from_those_of_lenses() -> None:

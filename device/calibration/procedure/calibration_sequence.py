@@ -386,9 +386,9 @@ def step_figures(step: Darks | Flats | PointSource) -> dict[str, float]:
 def _lens_figures(job: CalibrationJob, archive: Archive, calibration: Calibration) -> dict[str, float]:
     """Return the figures of lenslets, beside the head's calibration before if there is one; none behind a diffuser."""
     optics, geometry = job.spec.optics, calibration.geometry
-    spots = None if geometry is None else find_spots(calibration.psfs[0], geometry)
-    if optics is None or spots is None:
+    if optics is None or geometry is None or not geometry.has_spots:
         return {}
+    spots = find_spots(calibration.psfs[0], geometry)
     try:
         before = archive.load()
     except CalibrationError:  # none yet, or one that cannot be read

@@ -18,12 +18,14 @@ MAX_MOVED_UM = 1.0  # rms along an axis: 2 um cost 0.007 of the correlation of d
 Places = NDArray[np.float64]
 
 
-def lens_figures(spots: Spots, lenses: Lenses, earlier: Calibration | None) -> dict[str, float]:
-    """Return figures of the spots of a PSF for the calibration's record.
+def lens_figures(spots: Spots | None, lenses: Lenses, earlier: Calibration | None) -> dict[str, float]:
+    """Return figures of the spots of a PSF for the calibration's record; `spots` is None if there are too few.
 
     Number of lenses without a spot of their own, light beside the spots (a share), misfit of the spots (a share), mean
     focus in dpt, and, with an earlier calibration of the same lenses, the rms shift of the centres since, um.
     """
+    if spots is None:
+        return {"lenses_without_spot": float(len(lenses))}
     figures = {
         "lenses_without_spot": float(len(lenses_without_spot(spots, lenses))),
         "lens_light_beside": spots.beside,
@@ -31,8 +33,9 @@ def lens_figures(spots: Spots, lenses: Lenses, earlier: Calibration | None) -> d
         "lens_focus_dpt": float(spots.focus_dpt[:, 0].mean()),
     }
     before = None if earlier is None else find_spots(earlier.psfs[0], spots.geometry)
-    moved_um = None if before is None else shift_um(before.places_um, spots.places_um)
-    return figures if moved_um is None else figures | {"lens_moved_um": moved_um}
+    if before is None:
+        return figures
+    return figures | {"lens_moved_um": shift_um(before.places_um, spots.places_um)}
 
 
 def lens_messages(figures: dict[str, float]) -> Iterable[str]:
@@ -59,16 +62,16 @@ def lenses_without_spot(spots: Spots, lenses: Lenses) -> list[int]:
     return [number for number, row in enumerate(nearest, 1) if row.min() > OWN_SPOT * apart[number - 1].min()]
 
 
-def shift_um(before_um: Places, after_um: Places) -> float | None:
+def shift_um(before_um: Places, after_um: Places) -> float:
     """Return the rms change along an axis of the places of spots, beside a shift and rotation of all, um.
 
-    None if less than half of them are found again.
+    Of those that are found again, if these are at least half; else of all, as of another plate.
     """
     placed = _aligned(before_um, after_um)
     apart_um = _distances(placed, after_um)
     is_own = apart_um.min(axis=1) < SAME_SPOT_UM
     if is_own.mean() < 0.5:
-        return None
+        is_own[:] = True
     return float(np.sqrt(np.square(placed - after_um[apart_um.argmin(axis=1)])[is_own].mean()))
 
 

@@ -39,7 +39,7 @@ LITTLE_LIGHT = "too little light"
 UNEXPLAINED = "The picture does not explain this frame: parts of it may be false."
 # The words of these messages and of `quality_warnings` are sorted by KINDS in tests/hard/judgement.py.
 MISMATCHES = {
-    Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
+    Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this optic and camera, or measure it again.",
     Match.FOREIGN_OR_FAR: "The refraction of this eye is beyond 10 dpt, which this head does not correct, or the PSF "
     "is not that of this head.",
     Match.ROTATED: "The PSF is rotated by 180 degrees against this frame. Rotate the PSF by 180 degrees; run it again.",

@@ -79,8 +79,9 @@ class Spots:
     def of_eye(self, eye: Eye, field_deg: float = 0.0) -> Psf:
         """Return the PSF of an eye, mean over a field of view at whose places the lenses have other foci.
 
-        Near a spot the measured light is the model plus a rest, which moves with the spot, and fades as the wavefront
-        at the edge of the cell moves by a quarter of a wavelength. Elsewhere it is the model.
+        Near a spot it is the model plus what was measured beside it, which moves with the spot and falls to 1/e when
+        the wavefront at the corner of the cell changes by a quarter of a wavelength. Elsewhere it is the model, with
+        the light that was measured there if that is more than GAP_LIGHT.
 
         Parameters
         ----------
@@ -233,7 +234,10 @@ def find_spots(psf: Psf, geometry: Geometry) -> Spots | None:
 
 
 def without_noise(calibration: Calibration) -> Calibration:
-    """Return the calibration with the PSFs of lenslets without the noise between the spots; any other as it is."""
+    """Return the calibration with the PSFs of lenslets without the noise between the spots; any other as it is.
+
+    Light beside the spots stays if it is more than GAP_LIGHT.
+    """
     geometry = calibration.geometry
     if geometry is None or geometry.lens_focus_dpt is None:
         return calibration
@@ -245,7 +249,7 @@ def without_noise(calibration: Calibration) -> Calibration:
 
 
 class _SpotFit:
-    """Fit of one spot to the spectrum of the light around it, by place (um), and focus (dpt); its light is linear."""
+    """Fit of one spot to the spectrum of the light around it, by shift (um) and focus (dpt); its light is linear."""
 
     def __init__(self, spots: Spots, number: int) -> None:
         pitch_um = spots.geometry.pitch_um
@@ -277,7 +281,7 @@ class _SpotFit:
         return float((np.abs(self._seen - light * model) ** 2).sum() / (np.abs(self._seen) ** 2).sum())
 
     def best(self, start: Floats) -> tuple[Floats, float]:
-        """Return place and focus by Gauss-Newton steps from `start` on, and the light."""
+        """Return shift and focus by Gauss-Newton steps from `start` on, and the light."""
         values = start
         for _ in range(STEPS):
             model, light = self._fitted(values)
@@ -312,10 +316,10 @@ def _seen_spots(psf: Psf, pitch_um: float) -> tuple[Floats, Floats]:
 
 
 def _cells(places_um: Floats, light: Floats) -> tuple[Floats, tuple[Floats, ...], float]:
-    """Return centroid and places of each lens's cell, um, and the area of a place, um^2.
+    """Return the centroid of the cell of each spot's lens, its chords around it, and the distance of chords, um.
 
-    Each place of the iris belongs to the nearest lens. The iris has the radius for which the areas of the cells are
-    proportional to the light of the spots.
+    Each place of the iris belongs to the nearest spot. Of 17 radii of the iris that one is taken for which the areas of
+    the cells fit the light of the spots best.
     """
     reach_um = float(np.hypot(*places_um.T).max())
     nearest_um = np.sort(np.hypot(*(places_um[:, None] - places_um[None]).transpose(2, 0, 1)), axis=1)[:, 1]

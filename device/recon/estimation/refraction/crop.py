@@ -9,8 +9,8 @@ frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
 
 b is the mean of the score D' K^-1 r over frames that are drawn from the fit itself: the noise, and the smooth part that
 is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7). It is computed, at
-the cost of four more solves, behind a diffuser and where the window is smaller than the blurred field (areas);
-elsewhere it is small, and b = 0. The field edge is held.
+the cost of four more solves, only behind a diffuser whose blurred field is larger than the window (areas); elsewhere it
+is small, and b = 0. The field edge is held. Symbols: `crop_model`.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ Floats = NDArray[np.float64]
 class Refined:
     """Eye (M, J0, J45) in dpt as wavefront, and the misfit; `covariance` is (D' K^-1 D)^-1 of the first step, dpt^2.
 
-    `misfit` is the squared residual over its noise per sample: 0.4 to 0.8 where the model explains the frame.
-    `bias_dpt` is what b adds to a step; 0 where b is not computed. `rim_sd` is `pupil.dark_rim` of the last fit,
+    `misfit` is the squared residual over its noise per sample: below MAX_MISFIT where the model explains the frame.
+    `bias_dpt` is what b takes from a step; 0 where b is not computed. `rim_sd` is `pupil.dark_rim` of the last fit,
     `model_sd_dpt` the part of the sds by the model.
     """
 
@@ -66,7 +66,7 @@ class Refined:
 
     @property
     def is_whole(self) -> bool:
-        """True if the light of the frame comes through the whole PSF."""
+        """True if no part of the rim of the PSF is dark."""
         return self.rim_sd < MAX_RIM_SD
 
     @property

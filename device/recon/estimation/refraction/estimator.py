@@ -6,10 +6,11 @@ mean sphere M, cylinder J0, J45 and the field edge e (`likelihood`, `edge`, NUME
 
     E(M, J0, J45, e) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_T|^2 + s2
 
-|H_T|^2 includes SMEAR times its ring mean. R is the tapered spectrum of the frame minus the smooth part of the object
-behind the *candidate's* PSF. If that part is blurred by a fixed PSF, the estimate is biased by one third towards that
-PSF. The smooth part itself is fitted with the stored PSF for the coarse search over M, and with the PSF and edge found
-for each fine search.
+The search stretches the PSF of lenslets as well; only the picture (`otf`) uses the model of their spots. |H_T|^2
+includes `likelihood.SMEAR` times its ring mean. R is the tapered spectrum of the frame minus the smooth part of the
+object behind the *candidate's* PSF. If that part is blurred by a fixed PSF, the estimate is biased by one third towards
+that PSF. The smooth part itself is fitted with the stored PSF for the coarse search over M, and with the PSF and edge
+found for each fine search.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,7 +58,7 @@ MAX_SD_DPT = 1.5
 MAX_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MAX_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
-CUT = "part of the diffuser is dark, as behind a pupil that is small or off the axis"
+CUT = "light is missing at the rim of the PSF, as behind a pupil that is small or off the axis"
 MIN_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains -0.02 to 0.15 dB, and as |J|^2
 
 Floats = NDArray[np.float64]

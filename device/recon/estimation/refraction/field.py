@@ -134,7 +134,7 @@ class EdgePrior:
 
 
 def lamp_light(calibration: Calibration, grid: Grid) -> Image:
-    """Return an even retina in the light of the lamp, 1 on the axis and to the end of a sharp field, float32 (grid)."""
+    """Return the light of the lamp on an even retina: the ramp of a soft edge, else 1 everywhere, float32 (grid)."""
     if calibration.soft_edge_deg is None or calibration.geometry is None:
         return np.ones(grid.shape, np.float32)
     edge = EdgePrior(*calibration.soft_edge_deg, calibration.geometry.px_per_deg / grid.n).calibrated
