@@ -19,6 +19,7 @@
     device.json                   identity of the device (device_identity.py)
     reserve.bin                   space for records on a full disk (reserve_file.py)
     replaced/                     what a restored backup replaced (restoration.py)
+    record-key-id                 name of the key of the records' files (record_files.py)
     .lock                         lock of the commands that change the folder
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A new row therefore has its

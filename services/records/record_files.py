@@ -1,5 +1,10 @@
-"""Files of the records in a store: `patients/<id>.json`, `visits/<id>.json` and `captures/<id>/record.json`."""
+"""Files of the records in a store: `patients/<id>.json`, `visits/<id>.json` and `captures/<id>/record.json`.
 
+`record-key-id` names the key with which all of them are authenticated, if there is one.
+"""
+
+import hashlib
+import hmac
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -11,7 +16,7 @@ from services.errors import StoreDamaged
 from services.records import row_validation
 from services.records.record_document import Kind, RecordDocument, parse_document
 
-CAPTURE_RECORD = "record.json"
+CAPTURE_RECORD, KEY_ID = "record.json", "record-key-id"
 _FOLDERS: dict[Kind, str] = {"patient": "patients", "visit": "visits"}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
@@ -91,3 +96,18 @@ class RecordFiles:
         if kind != "capture" and path.exists():
             path.unlink()
             atomic_io.fsync_folder(path.parent)
+
+
+def new_key(folder: Path, key: bytes | None) -> bytes | None:
+    """Return the key if the files of a store were not all written with it; None without a key."""
+    path = folder / KEY_ID
+    return None if key is None or (path.exists() and path.read_bytes() == _key_id(key)) else key
+
+
+def note_key(folder: Path, key: bytes) -> None:
+    """Note durably that the files of a store are written with this key; OSError if the disk refuses."""
+    atomic_io.write_atomically(folder / KEY_ID, _key_id(key))
+
+
+def _key_id(key: bytes) -> bytes:
+    return hmac.new(key, b"id", hashlib.sha256).hexdigest().encode()

@@ -13,11 +13,15 @@ patient, a visit or a capture is in its rows and in a file (record_document.py),
     damaged or missing      whole                   restore the rows from the file
     damaged                 damaged or missing      none: one damaged record in the lists
 
+A file that another program wrote counts as damaged: its HMAC is not that of the store's key. A store that is opened
+with a key for the first time, such as a copy without its key, takes its files as they are and writes all of them again.
+
 A database that is missing or fails SQLite's integrity check is moved to `damaged/` and rebuilt from the files.
 """
 
 import logging
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
@@ -33,11 +37,12 @@ from services.records import record_rows, row_validation, schema
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.json_values import JsonObject
 from services.records.record_document import Kind, RecordDocument
-from services.records.record_files import RecordFiles
+from services.records.record_files import RecordFiles, new_key, note_key
 from services.records.record_rows import Content
 from services.records.record_signing import (
     PAGE_ROWS,
     contents_of,
+    documents_of,
     refuse_changed,
     rows_of,
     sign_changed,
@@ -84,7 +89,8 @@ class Recovery:
     def __init__(self, folder: Path, engine: Engine, rebuilt_because: str | None) -> None:
         self._folder = folder
         self._engine = engine
-        self._files = RecordFiles(folder, schema.key_of(engine))
+        self._new_key = new_key(folder, schema.key_of(engine))
+        self._files = RecordFiles(folder, None if self._new_key else schema.key_of(engine))
         self.report = RecoveryReport(rebuilt_because=rebuilt_because)
         self._restored_visits: list[tuple[RecordDocument, bool]] = []
 
@@ -115,6 +121,9 @@ class Recovery:
             if as_described and not missing:
                 write_signature(session, document)
         self._files.write_all([*to_write, *sign_changed(session)])
+        if self._new_key is not None:
+            RecordFiles(self._folder, self._new_key).write_all(_documents(session))
+            note_key(self._folder, self._new_key)
 
     def _id_in_file(self, damaged: PatientRow) -> str:
         """Return the id of the patient whose file has the number of a damaged row, which may have another id."""
@@ -254,6 +263,16 @@ class Recovery:
         ):
             if ids:
                 log.warning("%d %s: %s", len(ids), what, ", ".join(ids[:20]))
+
+
+def _documents(session: Session) -> Iterator[RecordDocument]:
+    """Yield the records of all readable rows."""
+    kinds: tuple[Kind, ...] = ("patient", "visit", "capture")
+    for kind in kinds:
+        keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
+        for start in range(0, len(keys), PAGE_ROWS):
+            yield from documents_of(session, kind, keys[start : start + PAGE_ROWS])
+            session.expire_all()
 
 
 def _delete_misnamed(session: Session, document: RecordDocument) -> None:

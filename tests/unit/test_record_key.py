@@ -11,6 +11,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.light_safety.dose_ledger import DoseLedgerState
+from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG, DoseLedgerLog
 from services.records.programme import load_programme
@@ -69,11 +70,20 @@ def test_a_rewritten_visit_is_not_restored_into_a_lost_database(tmp_path: Path, 
     assert checked_visits(tmp_path).damaged == [visit]
 
 
-def test_a_new_key_costs_no_record(tmp_path: Path, visit: str) -> None:
-    """Files of the key before are written again from their rows."""
+@pytest.mark.parametrize("without_database", [False, True])
+def test_a_new_key_costs_no_record(tmp_path: Path, visit: str, without_database: bool) -> None:
+    """A copy of a store without its key takes its files as they are, once, and writes all of them with its own."""
+    with CaptureStore(tmp_path, reserve_bytes=0, key=KEY) as store:
+        store.save(
+            Capture("kept", "OD", VirtualClock().wall(), True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"}
+        )
+    if without_database:
+        (tmp_path / DATABASE).unlink()
     for _ in range(2):
         with CaptureStore(tmp_path, reserve_bytes=0, key=KEY[::-1]) as store:
             assert visits_of(store).get(visit).fields["vision_od"] == "6/60"
+            assert [capture.id for capture in store.captures()] == ["kept"]
+        assert RecordFiles(tmp_path, KEY[::-1]).read("capture", "kept") is not None
         (tmp_path / DATABASE).unlink()
 
 
