@@ -4,9 +4,14 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.config.scene import ObjectSpec
+from device.errors import SpecError
+from device.optics.eye import iris_overlap
+from device.sim.effects.illumination import lit_share
 from device.sim.optical_setup import Scene
 from device.sim.plan import decide
 from device.sim.world import World
@@ -59,3 +64,27 @@ def scene(head: str, eye: Eye) -> InstrumentSpec:
 def world(spec: InstrumentSpec, *, is_flat: bool = False) -> World:
     """Return the world of a scene; `is_flat`: no lens has a curved image surface."""
     return World(spec, VirtualClock(), choose=partial(decide, without=("lens_curvature",) if is_flat else ()))
+
+
+def behind_pupil(wide: World, pupil_um: float, decentred_um: float) -> InstrumentSpec:
+    """Return the scene of a world with another pupil, and as much light on the retina as through the world's own one.
+
+    The iris loses what the pupil hides of it.
+    """
+    spec = wide.spec
+    assert spec.sim is not None
+    assert spec.optics is not None
+    iris_um = spec.optics.iris_um * spec.optics.angular_magnification
+    peak_e = float(wide.electrons_per_s(spec.light.colour).max()) * spec.camera.exposure_s
+    peak_e *= iris_overlap(decentred_um, pupil_um / 2, iris_um / 2)
+    eye = spec.sim.eye.model_copy(update={"pupil_um": pupil_um, "decentred_um": decentred_um})
+    return spec.model_copy(update={"sim": spec.sim.model_copy(update={"eye": eye, "peak_e": peak_e})})
+
+
+def light_in_pupil(spec: InstrumentSpec) -> float:
+    """Return the share of the ring's light that enters the pupil of a scene's eye, 0 to 1."""
+    axis_deg = np.zeros(1)
+    try:
+        return float(lit_share(Scene(spec, spec.light.colour), axis_deg, axis_deg)[0])
+    except SpecError:  # none
+        return 0.0

@@ -28,7 +28,7 @@ from device.sim.scene_files import lit_frames
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Counts, Mask, Reconstruction
-from tests.bench.element_scenes import HEADS, Eye, scene, world
+from tests.bench.element_scenes import HEADS, Eye, behind_pupil, light_in_pupil, scene, world
 from tests.bench.ring_correlation import resolution_lp_per_mm
 
 DETAIL_DEG, RIM_PX = 2.0, 3.0  # high-pass filter, and edge of the field that is left out
@@ -143,6 +143,8 @@ def main() -> None:
     parser.add_argument("--heads", nargs="*", choices=list(HEADS), default=list(HEADS))
     parser.add_argument("--frames", type=int, nargs="*", default=[1, 4])
     parser.add_argument("--m-dpt", type=float, default=0.0, help="mean sphere of the eyes; above 0: myopia")
+    parser.add_argument("--pupil-mm", type=float, help="of the eyes, with the light of a wide one on their retinas")
+    parser.add_argument("--decentred-mm", type=float, default=0.0, help="distance of that pupil from the axis")
     parser.add_argument("--curved", action="store_true", help="each lens is a thin plate with a curved image surface")
     asked = parser.parse_args()
     masks = [None, *asked.vessels, *[None] * (len(asked.photo) - len(asked.vessels))]
@@ -154,6 +156,10 @@ def main() -> None:
     missed = []
     for head in asked.heads:
         worlds = [world(scene(head, eye), is_flat=not asked.curved) for eye in eyes]
+        if asked.pupil_mm:
+            specs = [behind_pupil(wide, 1000 * asked.pupil_mm, 1000 * asked.decentred_mm) for wide in worlds]
+            worlds = [world(spec, is_flat=not asked.curved) for spec in specs]
+            print(f"{head}: {light_in_pupil(specs[0]):.0%} of the ring's light enters the pupil")
         takes = [Take.of(each, mask, max(asked.frames)) for each, mask in zip(worlds, masks, strict=True)]
         for count in asked.frames:
             found = [replace(take, frames=take.frames[:count]).figures() for take in takes]

@@ -202,10 +202,11 @@ def given_field(field_deg: float) -> Build:
 
 
 def foreign_psf(eye: Eye) -> HardFrame:
-    """Return a frame with the PSF of another diffuser of the same kind."""
+    """Return a frame with the PSF of another diffuser of the same kind, or of another layout of lenslets."""
     sim = eye.spec.sim
     assert sim is not None
-    other = replace(eye, changes=dict(eye.changes) | {"sim.seed": sim.seed + 100}).clean
+    head = "imx296_hexagonal" if eye.head == "imx296_lenslets" else eye.head
+    other = replace(eye, head=head, changes=dict(eye.changes) | {"sim.seed": sim.seed + 100}).clean
     return replace(eye.clean, psf=other.psf, sphere_dpt=None)
 
 

@@ -14,7 +14,11 @@ HIDDEN = {"cut by 18 %": 0.225, "small and off centre": 0.022}  # share of the P
 
 @pytest.mark.parametrize(
     ("head", "m_dpt", "peak_e", "pupil"),
-    [("imx296", 0.0, 8000.0, "small and off centre"), ("sim", -4.0, 15000.0, "cut by 18 %")],
+    [
+        ("imx296", 0.0, 8000.0, "small and off centre"),
+        ("sim", -4.0, 15000.0, "cut by 18 %"),
+        ("imx296_lenslets", 0.0, 8000.0, "cut by 18 %"),
+    ],
 )
 def test_the_pupil_is_found_and_the_picture_made_with_the_rest(
     head: str, m_dpt: float, peak_e: float, pupil: str

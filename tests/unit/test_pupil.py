@@ -48,3 +48,10 @@ def test_a_hidden_share_widens_only_the_deviations_that_are_known() -> None:
     known = {"sphere": 1.0, "sd": 0.3, "j0_sd": None, "j45_sd": 0.0, "refused": None}
     assert widened(known, 0.4) == pytest.approx(known | {"sd": 0.5, "j45_sd": 0.4})
     assert widened(None, 0.4) is None
+
+
+def test_a_softer_edge_hides_a_part_of_what_is_near_it() -> None:
+    places_um = np.array([-170.0, 0.0, 170.0])
+    passed = Pupil(-1e6, 0.0, 1e6, 170.0).passed(places_um, np.zeros(3))
+    np.testing.assert_allclose(passed, [0.841, 0.5, 0.159], atol=0.001)
+    assert Pupil(1.0, 2.0, 3.0, 170.0).moved(np.array([0.5, 0.0, -1.0])) == Pupil(1.5, 2.0, 2.0, 170.0)

@@ -76,6 +76,12 @@ class Spots:
         """Share of the light that is beside the spots: of clear gaps, scatter, and an uneven pedestal."""
         return 1 - float(self.light.sum())
 
+    @property
+    def lens_um(self) -> float:
+        """Diameter of a disc of the mean area of the cells, um."""
+        areas_um2 = [cell[:, 2].sum() * self.chord_um for cell in self.cells_um]
+        return float(np.sqrt(4 / np.pi * np.mean(areas_um2)))
+
     def of_eye(self, eye: Eye, field_deg: float = 0.0) -> Psf:
         """Return the PSF of an eye, mean over a field of view at whose places the lenses have other foci.
 

@@ -31,7 +31,7 @@ from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.likelihood import RefractionLikelihood
 from device.recon.estimation.refraction.lit_disc import seen_disc
-from device.recon.estimation.refraction.pupil import Pupil, PupilFinder
+from device.recon.estimation.refraction.pupil import SOFT_UM, Pupil, PupilFinder
 from device.recon.estimation.refraction.uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
@@ -328,7 +328,9 @@ class RefractionEstimator:
         """
         found = self.find(counts, dark, defects)
         m_dpt = found.m_dpt if isinstance(found, Refraction) else 0.0
-        return PupilFinder(self._edges, self._planner, self._reach_px)(counts, dark, defects, m_dpt)
+        spots = find_spots(self._calibration.psfs[self._index], self.geometry)
+        soft_um = SOFT_UM if spots is None else spots.lens_um / 4  # sd of an even disc along an axis
+        return PupilFinder(self._edges, self._planner, self._reach_px, soft_um)(counts, dark, defects, m_dpt)
 
     @property
     def _is_refined(self) -> bool:

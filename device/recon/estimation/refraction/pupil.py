@@ -1,9 +1,9 @@
 """Pupil that hides part of the diffuser: the disc of the stored PSF that explains a frame; NUMERICS.md 7.10.
 
-Behind a weak diffuser a place in the PSF is lit by the same place of the diffuser, up to the blur by its slopes. The
-PSF behind a small or decentred pupil is therefore the stored one times a soft disc, the image of the pupil. The disc is
-searched on a coarse grid by the likelihood of the spectrum (`likelihood`), and then refined with the eye by
-Gauss-Newton steps on the likelihood of the frame (`crop_model`).
+Behind a weak diffuser a place in the PSF is lit by the same place of the diffuser, up to the blur by its slopes, and a
+spot of lenslets by its lens. The PSF behind a small or decentred pupil is therefore the stored one times a soft disc,
+the image of the pupil. The disc is searched on a coarse grid by the likelihood of the spectrum (`likelihood`), and then
+refined with the eye by Gauss-Newton steps on the likelihood of the frame (`crop_model`).
 """
 
 from typing import NamedTuple
@@ -40,11 +40,17 @@ Floats = NDArray[np.float64]
 
 
 class Pupil(NamedTuple):
-    """Image of a pupil on the diffuser, a disc relative to the centre of the PSF, in um."""
+    """Image of a pupil on the element, a disc relative to the centre of the PSF with the sd of its edge, in um."""
 
     right_um: float
     down_um: float
     radius_um: float
+    soft_um: float = SOFT_UM
+
+    def moved(self, by_um: Floats) -> "Pupil":
+        """Return the disc with its centre (right, down) moved and its radius larger by three distances, um."""
+        right_um, down_um, larger_um = by_um
+        return Pupil(self.right_um + right_um, self.down_um + down_um, self.radius_um + larger_um, self.soft_um)
 
     @property
     def nearest_um(self) -> float:
@@ -54,7 +60,7 @@ class Pupil(NamedTuple):
     def passed(self, right_um: Floats, down_um: Floats) -> Floats:
         """Return the share of the light, 0 to 1, that reaches places of the PSF, relative to its centre in um."""
         inward_um = self.radius_um - np.hypot(right_um - self.right_um, down_um - self.down_um)
-        return np.asarray(ndtr(inward_um / SOFT_UM))
+        return np.asarray(ndtr(inward_um / self.soft_um))
 
     def hide(self, psf: Psf, pitch_um: float) -> tuple[Psf, float]:
         """Return the PSF behind the pupil, with the sum of `psf`, and the share of the light that is hidden."""
@@ -78,7 +84,7 @@ class PupilModel(CropModel):
         """Set OTF, its derivatives and the preconditioner to an eye behind the pupil."""
         pairs = [(eye_dpt + step, eye_dpt - step, self.pupil, self.pupil) for step in np.eye(3) * DERIVATIVE_STEP_DPT]
         for step_um in np.eye(3) * DERIVATIVE_STEP_UM:
-            above, below = (Pupil(*(np.array(self.pupil) + sign * step_um)) for sign in (1, -1))
+            above, below = (self.pupil.moved(sign * step_um) for sign in (1, -1))
             pairs.append((eye_dpt, eye_dpt, above, below))
         changes = [self._behind(eye, disc) - self._behind(other, less) for eye, other, disc, less in pairs]
         steps = (DERIVATIVE_STEP_DPT,) * 3 + (DERIVATIVE_STEP_UM,) * 3
@@ -110,10 +116,13 @@ def _places_um(grid: Grid, pitch_um: float, stretch: Transform) -> tuple[Floats,
 
 
 class PupilFinder:
-    """Finder of the pupil in the frames of an `EdgeLikelihood`, for a PSF with this radius in pixels."""
+    """Finder of the pupil in the frames of an `EdgeLikelihood`.
 
-    def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
-        self._edges = edges
+    `psf_radius_px`: of the PSF; `soft_um`: sd of the edge of a pupil's image in it.
+    """
+
+    def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float, soft_um: float = SOFT_UM) -> None:
+        self._edges, self._soft_um = edges, soft_um
         self._radius_um = psf_radius_px * edges.likelihood.geometry.pitch_um
         self._model = PupilModel(edges, planner, psf_radius_px, Pupil(0.0, 0.0, self._radius_um))
 
@@ -137,11 +146,12 @@ class PupilFinder:
 
     def _candidates(self) -> list[Pupil]:
         radius_um = self._radius_um
-        found = [Pupil(0.0, 0.0, share * radius_um) for share in CENTRED]
+        found = [Pupil(0.0, 0.0, share * radius_um, self._soft_um) for share in CENTRED]
         for turn in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
             for share in EDGES:
                 away_um = (LARGE - share) * radius_um
-                found.append(Pupil(away_um * np.cos(turn), away_um * np.sin(turn), LARGE * radius_um))
+                right_um, down_um = away_um * np.cos(turn), away_um * np.sin(turn)
+                found.append(Pupil(right_um, down_um, LARGE * radius_um, self._soft_um))
         return found
 
     def _refined(self, pupil: Pupil, eye_dpt: Floats) -> Pupil | None:
@@ -164,7 +174,7 @@ class PupilFinder:
             by_eye_dpt = np.clip(step[:3], -LARGEST_STEP_DPT, LARGEST_STEP_DPT)
             by_disc_um = step[3:] * min(1.0, LARGEST_STEP_UM / max(float(np.abs(step[3:]).max()), 1e-9))
             eye_dpt, before_um = eye_dpt + by_eye_dpt, pupil.nearest_um
-            pupil = Pupil(*(np.array(pupil) + by_disc_um).tolist())
+            pupil = pupil.moved(by_disc_um)
             if not pupil.radius_um > MIN_RADIUS_UM:  # also for NaN
                 return None
             moved_um = abs(pupil.nearest_um - before_um)
