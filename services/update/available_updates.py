@@ -6,11 +6,11 @@ from pathlib import Path
 from device.clock import Clock
 from services.errors import UpdateError, UpdateNotFound, UpdateSourceRemoved
 from services.update import channel, preconditions, signers, sources
+from services.update.channel_memory import ChannelMemory, SeenChannel
 from services.update.ipc import FoundUpdate, StoredError
 from services.update.rauc import Rauc, Release
 from services.update.settings import UpdateSettings
 from services.update.sources import Progress
-from services.update.state import StateFile
 
 log = logging.getLogger(__name__)
 
@@ -25,8 +25,9 @@ class AvailableUpdates:
     The caller holds the update lock during `on_drives`, `fetch`, `fetch_found` and `download`.
     """
 
-    def __init__(self, settings: UpdateSettings, clock: Clock, rauc: Rauc, runs: str, state: StateFile) -> None:
-        self._settings, self._clock, self._rauc, self._runs, self._state = settings, clock, rauc, runs, state
+    def __init__(self, settings: UpdateSettings, clock: Clock, rauc: Rauc, runs: str) -> None:
+        self._settings, self._clock, self._rauc, self._runs = settings, clock, rauc, runs
+        self._memory = ChannelMemory(settings.folder)
 
     def newer_offer(self) -> channel.Offer | None:
         """Return the channel's offer if it is newer than the running version, else None.
@@ -76,7 +77,7 @@ class AvailableUpdates:
     def release(self, bundle: Path) -> Release:
         """Return the metadata of a bundle; errors of `Rauc.release`, UpdateUntrusted also for a revoked signer."""
         release = self._rauc.release(bundle)
-        if revoked := self._state.read().revoked:
+        if revoked := self._memory.read().revoked:
             signers.refuse_revoked(signers.bundle_certificates(bundle), revoked)
         return release
 
@@ -101,13 +102,13 @@ class AvailableUpdates:
         return found
 
     def _offer(self) -> tuple[sources.UpdateServer, channel.Offer]:
-        server, seen = self._server(), self._state.read()
+        server, seen = self._server(), self._memory.read()
         content = server.read_small_file(channel.CHANNEL_FILE)
         offer = channel.verify_channel(content, self._settings.keyring, seen.revoked)
-        channel.refuse_stale(offer, seen.channel_number, self._clock.wall().date())
-        revoked = tuple(sorted({*seen.revoked, *offer.revoked}))
-        if (offer.number, revoked) != (seen.channel_number, seen.revoked):
-            self._state.write(channel_number=offer.number, revoked=revoked)
+        channel.refuse_stale(offer, seen.number, self._clock.wall().date())
+        now_seen = SeenChannel(number=offer.number, revoked=tuple(sorted({*seen.revoked, *offer.revoked})))
+        if now_seen != seen:
+            self._memory.write(now_seen)
         return server, offer
 
     def _server(self) -> sources.UpdateServer:

@@ -40,6 +40,7 @@ State = Literal[
     "refused",
     "interrupted",
 ]
+MAX_MESSAGE_CHARS = 500  # a message may cite a file of another maker
 UNDER_WAY = ("looking", "fetching", "installing")
 Id = Field(pattern="^[0-9a-f]{16}$")
 
@@ -55,7 +56,7 @@ class StoredError(BaseModel):
     @classmethod
     def of(cls, error: DiffuscopeError) -> Self:
         """Return the stored form of an error."""
-        return cls(code=error.code, message=error.message, remedy=error.remedy)
+        return cls(code=error.code, message=error.message[:MAX_MESSAGE_CHARS], remedy=error.remedy)
 
 
 class FoundUpdate(BaseModel):
@@ -83,8 +84,7 @@ class UpdateState(BaseModel):
     error. `ill`: health checks that failed before the update. `looked`: a search was done since the last install.
     `boot`: id of the boot in which `state` was written. `settling`: the tried version itself wrote the state.
     `offered`: newer version in the channel. `spent_s`: duration of the last install. `took_s`: duration of the last
-    committed update, its install and its boot until it was found healthy. `channel_number`, `revoked`: highest number,
-    and all revoked keys, of the channel files seen so far.
+    committed update, its install and its boot until it was found healthy.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)  # later releases may add fields
@@ -102,8 +102,6 @@ class UpdateState(BaseModel):
     settling: bool = False
     spent_s: float = Field(default=0.0, ge=0)
     took_s: float | None = Field(default=None, ge=0)
-    channel_number: int = Field(default=0, ge=0)
-    revoked: tuple[str, ...] = ()
 
 
 class UpdateRequest(BaseModel):
@@ -122,7 +120,7 @@ class UpdateRequest(BaseModel):
 
 
 def read_state(folder: Path) -> UpdateState:
-    """Return the stored state; UpdateState() if it is missing, unreadable or invalid: no update is refused for that."""
+    """Return the stored state; UpdateState() if it is missing, unreadable or invalid, since it is informative only."""
     try:
         return UpdateState.model_validate_json(_read(folder / STATE_FILE, MAX_STATE_BYTES))
     except (OSError, ValidationError):

@@ -34,7 +34,7 @@ class Updater:
         self._rauc = Rauc(settings.rauc)
         self._journal = StateFile(settings.folder)
         self.running_version = runs or version("diffuscope")
-        self._available = AvailableUpdates(settings, clock, self._rauc, self.running_version, self._journal)
+        self._available = AvailableUpdates(settings, clock, self._rauc, self.running_version)
         self._reported = (-1, "")
 
     def check(self, download: bool = False) -> channel.Offer | None:

@@ -26,6 +26,7 @@ from services.errors import (
 )
 from services.update.available_updates import AvailableUpdates
 from services.update.channel import Offer, refuse_stale, verify_channel
+from services.update.channel_memory import FILES, ChannelMemory, SeenChannel
 from services.update.preconditions import parse_version, refuse_unsuitable
 from services.update.rauc import Rauc, Release
 from services.update.settings import UpdateSettings, load_settings
@@ -162,8 +163,7 @@ def test_an_old_file_of_the_channel_is_refused() -> None:
 
 def test_the_device_keeps_number_and_revoked_keys_of_the_channel(keys: Path, site: Site, tmp_path: Path) -> None:
     settings = UpdateSettings(channel=site.url, authority=keys / "web.crt", keyring=keys / "ca.crt", folder=tmp_path)
-    state = StateFile(tmp_path)
-    available = AvailableUpdates(settings, VirtualClock(), Rauc(["no-such-rauc"]), "1.0", state)
+    available = AvailableUpdates(settings, VirtualClock(), Rauc(["no-such-rauc"]), "1.0")
 
     def answer(number: int, *revoked: str) -> None:
         fields = offer(CONTENT).model_dump(mode="json") | {
@@ -178,9 +178,13 @@ def test_the_device_keeps_number_and_revoked_keys_of_the_channel(keys: Path, sit
     answer(8, "b" * 64)
     with pytest.raises(UpdateStale):
         answer(7)
-    assert (state.read().channel_number, state.read().revoked) == (8, ("a" * 64, "b" * 64))
+    assert ChannelMemory(tmp_path).read() == SeenChannel(number=8, revoked=("a" * 64, "b" * 64))
     answer(9, key_of(keys))
-    with pytest.raises(UpdateUntrusted, match="is revoked"):
+    for name in FILES:
+        with pytest.raises(UpdateUntrusted, match="is revoked"):
+            answer(10)
+        (tmp_path / name).write_bytes(b"{}")
+    with pytest.raises(UpdateFailed, match="revoked keys cannot be read"):
         answer(10)
 
 
@@ -202,7 +206,8 @@ def test_a_revoked_key_signs_neither_channel_nor_bundle(keys: Path, tmp_path: Pa
         refuse_revoked(bundle_certificates(bundle), {key_of(keys)})
     for content in (b"", b"short", CONTENT, CONTENT + (1 << 40).to_bytes(8, "big")):
         bundle.write_bytes(content)
-        refuse_revoked(bundle_certificates(bundle), {key_of(keys)})  # RAUC refuses it
+        with pytest.raises(UpdateUntrusted, match="cannot be read"):
+            refuse_revoked(bundle_certificates(bundle), {key_of(keys)})
 
 
 def test_a_channel_of_a_signer_for_another_purpose_is_refused(keys: Path) -> None:
