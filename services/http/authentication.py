@@ -7,6 +7,7 @@ from threading import Lock
 from starlette.requests import HTTPConnection
 
 from device.clock import Clock
+from device.errors import StoreError
 from services.errors import RecordNotFound, SecretWrong, SetupRequired, SignInLockedOut
 from services.http.client_limits import Client
 from services.identity.lock_out import LockOut
@@ -40,11 +41,12 @@ OWN_SCREEN = Peer("own screen", True)
 class Authenticator:
     """Users, their logins and the lock-out of one data folder. Thread-safe.
 
-    `has_demo`: until the first user is created, requests from the device itself are those of `DEMO_USER`.
+    `has_demo`: until the first user is created, requests from the device itself are those of `DEMO_USER`. `refusal`: as
+    of `UserTable`.
     """
 
-    def __init__(self, folder: Path, clock: Clock, has_demo: bool = False) -> None:
-        self.users = UserTable(folder)
+    def __init__(self, folder: Path, clock: Clock, has_demo: bool = False, refusal: StoreError | None = None) -> None:
+        self.users = UserTable(folder, refusal)
         self.logins = Logins(self.users, clock)
         self._lock_out = LockOut(folder, clock)
         self._has_demo = has_demo

@@ -181,7 +181,7 @@ def serve(
             event_log_routes(event_log, UsbDrives(), clock),
             backup_routes(backups, store, UsbDrives(), clock),
         ]
-        authenticator = Authenticator(data / FOLDER, clock, has_demo=_has_demo(spec, address))
+        authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, address), store.refusal)
         app = create_app(
             arbiter,
             authenticator,

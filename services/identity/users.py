@@ -58,11 +58,12 @@ class UserTable:
     """Table of the users in `folder`; thread-safe, also with other processes.
 
     The first user is an administrator, and the last administrator stays. A table that is damaged, or missing although
-    users were created, is StoreDamaged for every use: no user is admitted.
+    users were created, is StoreDamaged for every use: no user is admitted. `refusal`: raised for every change; the
+    folder is a copy in memory, which ends with the program (read_only_store.py).
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, refusal: StoreError | None = None) -> None:
+        self._folder, self._refusal = folder, refusal
         self._lock = Lock()
         self._read_at: tuple[int, ...] | None = None
         self._entries: dict[str, _Entry] = {}
@@ -156,6 +157,8 @@ class UserTable:
     @contextmanager
     def _changed(self) -> Iterator[dict[str, _Entry]]:
         """Change the table within the context; it is written at the end, unless the context raises."""
+        if self._refusal is not None:
+            raise type(self._refusal)(self._refusal.message, self._refusal.remedy)
         with _disk_errors():
             atomic_io.make_private(self._folder)
             with atomic_io.file_lock(self._folder / ".lock"):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import InputError
+from device.errors import InputError, StoreReadOnly
 from services import cli
 from services.errors import ConfirmationRequired, LoginRequired, RecordNotFound, StoreDamaged
 from services.identity.lock_out import MAX_OWN_SCREEN_WAIT_S, MAX_WAIT_S, LockOut
@@ -62,6 +62,20 @@ def test_there_is_always_an_administrator(tmp_path: Path, users: UserTable) -> N
         with pytest.raises(InputError, match="administrator"):
             change()
     assert not UserTable(tmp_path / "new").has_begun
+
+
+def test_a_copy_in_memory_takes_no_change(users: UserTable, tmp_path: Path) -> None:
+    """Of a disk that takes no changes: they would be gone after the next start."""
+    copy = UserTable(tmp_path / "access", refusal=StoreReadOnly("the disk is read-only"))
+    assert copy.verify("Asha", PIN) is not None
+    for change in (
+        lambda: copy.add("Ravi", PIN, ["reader"]),
+        lambda: copy.change("Asha", secret=PASSPHRASE),
+        lambda: copy.remove("Asha"),
+    ):
+        with pytest.raises(StoreReadOnly, match="read-only"):
+            change()
+    assert users.verify("Asha", PIN) is not None
 
 
 def test_an_unknown_user_cannot_be_changed(users: UserTable) -> None:
