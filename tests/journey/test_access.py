@@ -15,6 +15,7 @@ from services.errors import AuthenticationError
 from services.health.clock_request import REQUEST
 from services.http.access import ACCESS, Access
 from services.http.app import create_app
+from services.http.audit_trail import ACTIONS, UNRECORDED
 from services.http.authentication import OWN_SCREEN, Authenticator, Peer
 from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
@@ -334,6 +335,12 @@ def test_the_time_of_a_tablet_is_accepted_forward_and_an_administrator_sets_it_b
     assert fields == [("Asha", "set-clock-back", both + earlier), ("Ravi", "set-clock", both + later)]
 
 
+def test_each_operation_is_recorded_or_named_as_unrecorded() -> None:
+    assert ACTIONS.keys().isdisjoint(UNRECORDED)
+    assert ACTIONS.keys() | UNRECORDED == ACCESS.keys()
+    assert {operation.split()[0] for operation in UNRECORDED} == {"GET", "POST"}
+
+
 def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:
     """Sign-in, its failure, view, change, refused light: user, record, field, no value; a stranger fills no disk."""
     log = AuditLog(tmp_path, b"k" * 32, fresh.clock)
@@ -350,6 +357,9 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
     ask(app, "POST", "/api/captures", token, json={"key": "2" * 16, "eye": "OD", "visit": visit, "slot": "R-centre"})
     for _ in range(3):
         ask(app, "GET", at)
+        ask(app, "GET", "/api/visits", token)
+        ask(app, "GET", "/api/visits/none", token)
+        ask(app, "POST", "/api/visits", token, headers={"Host": "evil.example"})
     found = [(one.user, one.action, one.record, one.more.get("field"), one.more["status"]) for one in log.entries(100)]
     assert found[::-1] == [
         ("Asha", "sign-in", "", None, "403"),
@@ -359,6 +369,9 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
         ("Asha", "view", visit, None, "200"),
         ("Asha", "capture", visit, None, "409"),
         ("", "view", visit, None, "401"),
+        ("Asha", "list-visits", "", None, "200"),
+        ("Asha", "view", "none", None, "404"),
+        ("", "refused", "", None, "400"),
     ]
     assert {one.more["clock"] for one in log.entries(100)} == {"not_set"}
     assert b"Meena" not in (tmp_path / "audit-log.jsonl").read_bytes()
