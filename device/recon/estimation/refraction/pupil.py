@@ -49,7 +49,7 @@ class Pupil(NamedTuple):
 
     def moved(self, by_um: Floats) -> "Pupil":
         """Return the disc with its centre (right, down) moved and its radius larger by three distances, um."""
-        right_um, down_um, larger_um = by_um
+        right_um, down_um, larger_um = by_um.tolist()
         return Pupil(self.right_um + right_um, self.down_um + down_um, self.radius_um + larger_um, self.soft_um)
 
     @property
