@@ -1,6 +1,5 @@
 """Scenes of the benches of elements: a head, its element at the iris, and an eye at the light of its budget."""
 
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,6 @@ from device.errors import SpecError
 from device.optics.eye import iris_overlap
 from device.sim.effects.illumination import lit_share
 from device.sim.optical_setup import Scene
-from device.sim.plan import decide
 from device.sim.world import World
 from tests.lens_packing import lenses_in_iris, random_packing
 from tests.simulated import SCENES, coarse
@@ -62,8 +60,12 @@ def scene(head: str, eye: Eye) -> InstrumentSpec:
 
 
 def world(spec: InstrumentSpec, *, is_flat: bool = False) -> World:
-    """Return the world of a scene; `is_flat`: no lens has a curved image surface."""
-    return World(spec, VirtualClock(), choose=partial(decide, without=("lens_curvature",) if is_flat else ()))
+    """Return the world of a scene; `is_flat`: no lens has a curved image surface, and its calibration says so."""
+    assert spec.optics is not None
+    if is_flat:
+        element = spec.optics.element.model_copy(update={"flat_field": True})
+        spec = spec.model_copy(update={"optics": spec.optics.model_copy(update={"element": element})})
+    return World(spec, VirtualClock())
 
 
 def behind_pupil(wide: World, pupil_um: float, decentred_um: float) -> InstrumentSpec:
