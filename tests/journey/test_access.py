@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from device.clock import VirtualClock
-from services.errors import AuthenticationError
+from services.errors import AuthenticationError, LoginRequired
 from services.health.clock_request import REQUEST
 from services.http.access import ACCESS, Access
 from services.http.app import create_app
@@ -19,7 +19,7 @@ from services.http.authentication import OWN_SCREEN, Authenticator, Peer
 from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
-from services.identity.users import ROLES, Role
+from services.identity.users import ROLES, Role, User
 from services.records.audit_log import AuditLog
 from tests.golden import http_transcript
 from tests.journey.conftest import Rig, read_event_stream
@@ -234,6 +234,26 @@ def test_a_user_is_managed_and_signed_out_by_each_change(fresh: Rig) -> None:
     assert ask(app, "DELETE", "/api/users/Ravi", asha).json()["users"][0]["name"] == "Asha"
     assert not reads(token)
     assert ask(app, "DELETE", "/api/users/Asha", asha).status_code == 422
+
+
+def test_a_reset_by_an_administrator_is_not_overwritten_by_the_users_own_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reset comes between the check of the old PIN and the change to the new one."""
+    authenticator = Authenticator(tmp_path, VirtualClock())
+    users = authenticator.users
+    users.add("Asha", PIN, ["administrator"])
+    token, verify = authenticator.sign_in("Asha", PIN, OWN_SCREEN), users.verify
+
+    def verify_before_reset(name: str, secret: str) -> User | None:
+        user = verify(name, secret)
+        users.change("Asha", secret="918274")
+        return user
+
+    monkeypatch.setattr(users, "verify", verify_before_reset)
+    with pytest.raises(LoginRequired):
+        authenticator.change_secret(token, PIN, "567390", OWN_SCREEN)
+    assert verify("Asha", "918274") is not None
 
 
 def test_a_risk_needs_the_secret_again_and_polling_does_not_extend_a_login(fresh: Rig) -> None:

@@ -164,6 +164,16 @@ def test_a_login_ends_idle_by_age_by_sign_out_and_with_a_change_of_its_user(
     assert logins.user(lasting, acts=True) is None
 
 
+def test_a_login_of_a_removed_user_stays_ended_when_the_name_is_given_again(
+    users: UserTable, clock: VirtualClock
+) -> None:
+    logins = Logins(users, clock)
+    token = logins.begin(users.add("Ravi", PIN, ["reader"]))
+    users.remove("Ravi")
+    users.add("Ravi", PASSPHRASE, ["technician"])
+    assert logins.user(token) is None
+
+
 def test_a_risk_needs_the_secret_of_the_last_minutes(users: UserTable, clock: VirtualClock) -> None:
     logins = Logins(users, clock)
     token = logins.begin(users.users()[0])
