@@ -1,15 +1,19 @@
-"""Files that come from people and their computers: lists of a folder without hidden companions, and text in UTF-8.
+"""Files that come from others: lists of a folder without hidden companions, text in UTF-8, files of limited size.
 
 macOS writes a companion `._NAME` (AppleDouble, RFC 1740) beside each file on FAT, exFAT and network drives, and drives
 get hidden folders such as `.Trashes`: no list of this module has them.
 """
 
 import codecs
+import io
+import os
+import stat
 from pathlib import Path
 
 from device.errors import SpecError
 
 APPLE_DOUBLE = b"\x00\x05\x16\x07"
+OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # no link is followed, no pipe waited for
 UTF8_REMEDY = "Save the file again as UTF-8: most editors have the encoding under Save as."
 _WIDE_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)  # that of UTF-32 LE begins as UTF-16 LE
 
@@ -27,6 +31,17 @@ def files_in(folder: Path, *patterns: str) -> list[Path]:
 def is_hidden(path: Path, folder: Path) -> bool:
     """Return whether the name of a path below `folder`, or of a folder between them, begins with a dot."""
     return any(part.startswith(".") for part in path.relative_to(folder).parts)
+
+
+def read_plain_file(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a regular file, at most `most_bytes`; OSError for any other, a link or a longer file."""
+    with io.FileIO(os.open(path, OPEN_FLAGS), closefd=True) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(0, "it is no plain file")
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise OSError(0, f"it is longer than {most_bytes} bytes")
+    return content
 
 
 def read_text(path: Path) -> str:

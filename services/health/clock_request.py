@@ -12,12 +12,15 @@ from pathlib import Path
 
 from device import atomic_io
 from device.clock import Clock, SystemClock, set_system_clock
+from device.user_files import read_plain_file
 from services.errors import ClockBackwards, ClockRefused
 from services.health.clock_source import BROWSER_SOURCE, clock_state
 from services.health.thresholds import EARLIEST_DATE
 
 REQUEST = "run/diffuscope-clock/request"
 LATEST_DATE = datetime(2060, 1, 1, tzinfo=UTC)  # end of the device's certificates
+MAX_REQUEST_BYTES = 64
+WORLD_READABLE = 0o644  # the instrument is another user
 BACK = "back "  # before the time in the request of an administrator
 
 
@@ -45,16 +48,20 @@ def take_request(set_clock: Callable[[datetime], None], clock: Clock, root: Path
     """Set the clock as requested, by `set_clock`, and return a sentence for the journal.
 
     The request is removed first, so that an invalid one is not repeated. Nothing is set if the clock has a source now.
+    The instrument may write the folder, and the caller is root: no link is followed, and OSError for a long request.
     """
-    content = (root / REQUEST).read_bytes().decode("ascii")
-    (root / REQUEST).unlink()
+    try:
+        content = read_plain_file(root / REQUEST, MAX_REQUEST_BYTES).decode("ascii")
+    finally:
+        (root / REQUEST).unlink()
     by_administrator = content.startswith(BACK)
     now = datetime.fromisoformat(content.removeprefix(BACK))
     before = clock.wall()
     if not _is_settable(now, by_administrator, root) or (now < before and not by_administrator):
         return f"The time of a tablet, {now}, is not needed"
     set_clock(now)
-    (root / BROWSER_SOURCE).write_text(f"{before.isoformat()} {now.isoformat()}\n", encoding="ascii")
+    source = f"{before.isoformat()} {now.isoformat()}\n"
+    atomic_io.write_atomically(root / BROWSER_SOURCE, source.encode(), WORLD_READABLE)
     return f"The clock was set by a tablet, from {before} to {now}"
 
 

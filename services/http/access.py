@@ -8,11 +8,12 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from starlette.requests import HTTPConnection, Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.errors import AccessDenied, LoginRequired, SetupRequired
+from services.errors import AccessDenied, LoginRequired, SetupRequired, StoreDamaged
 from services.http.authentication import Authenticator, Peer
 from services.http.rate_limits import RateLimits
-from services.http.security import SAFE_METHODS
+from services.http.security import SAFE_METHODS, ErrorResponse
 from services.identity.users import ROLES, Role, User
 
 COOKIE, SECURE_COOKIE = "login", "__Host-login"
@@ -62,6 +63,7 @@ ACCESS: dict[str, Access] = {
     "POST /api/users": USERS,
     "PATCH /api/users/{name}": USERS,
     "DELETE /api/users/{name}": USERS,
+    "GET /api/openapi.json": ANY_USER,
     "GET /api/audit": ADMINISTRATION,
     "GET /api/status": MONITORED,
     "GET /api/health": MONITORED,
@@ -127,8 +129,9 @@ def access_required(authenticator: Authenticator, rates: RateLimits) -> Callable
     """Return the dependency of every endpoint: it admits the user of a request by `ACCESS`, or raises.
 
     It leaves in `request.state` the `user` (None for a request without a login), `operation` and `audit_address` for
-    the audit trail, and `is_admitted`, which a stream asks again while it is open. LoginRequired, SetupRequired,
-    ConfirmationRequired or AccessDenied; TooManyRequests beyond the rate of an address, or of a user who is admitted.
+    the audit trail, and `is_admitted`, by which `may` asks for an operation while the request is open. LoginRequired,
+    SetupRequired, ConfirmationRequired or AccessDenied; TooManyRequests beyond the rate of an address, or of a user who
+    is admitted.
     """
 
     async def admit(request: Request) -> None:
@@ -142,9 +145,36 @@ def access_required(authenticator: Authenticator, rates: RateLimits) -> Callable
         request.state.user = None
         request.state.user = user = _admitted(authenticator, rule, token, peer, acts)
         rates.count(operation, peer.address if user is None else user.name)
-        request.state.is_admitted = lambda: _is_admitted(authenticator, rule, token, peer)
+        request.state.is_admitted = lambda asked: _is_admitted(authenticator, ACCESS[asked], token, peer)
 
     return admit
+
+
+class AdmittedAnswers:
+    """ASGI middleware: a success that `access_required` has not admitted becomes AccessDenied.
+
+    A route that is no endpoint of FastAPI, such as a mounted application, has no dependencies. `answer` turns an error
+    into a response.
+    """
+
+    def __init__(self, app: ASGIApp, answer: ErrorResponse) -> None:
+        self.app, self._answer = app, answer
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one ASGI request to the application; its answer is refused unless its operation was admitted."""
+        is_refused = False
+
+        async def send_admitted(message: Message) -> None:
+            nonlocal is_refused
+            is_success = message["type"] == "http.response.start" and message["status"] < 300
+            if is_success and "operation" not in scope.get("state", {}):
+                is_refused = True
+                refused = AccessDenied(f"{scope['method']} {scope['path']} is not in the table of rights")
+                await self._answer(refused)(scope, receive, send)
+            elif not is_refused:
+                await send(message)
+
+        await self.app(scope, receive, send_admitted)
 
 
 def _template(request: Request) -> str:
@@ -172,6 +202,14 @@ def require_light_role(request: Request, visit: str | None) -> None:
     role: Role = "technician" if visit is None else "screener"
     if role not in signed_in(request).roles:
         raise AccessDenied(f"light {'without' if visit is None else 'for'} a visit needs the role {role}")
+
+
+def may(request: Request, operation: str) -> bool:
+    """Return whether the user of a request may also send `operation`, a key of `ACCESS`, now."""
+    try:
+        return bool(request.state.is_admitted(operation))
+    except StoreDamaged:  # nobody gets in; the device itself still reads its status
+        return False
 
 
 def signed_in(request: Request) -> User:

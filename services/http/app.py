@@ -7,13 +7,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 from fastapi import APIRouter, Depends, FastAPI
+from fastapi.responses import JSONResponse
 
 from services.delivery.removal import PictureRemoval
 from services.delivery.upload_worker import UploadWorker, archive_builder
 from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
 from services.health.alert_monitor import AlertMonitor, AlertSources
-from services.http.access import access_required
+from services.http.access import AdmittedAnswers, access_required
 from services.http.audit_trail import AuditTrail
 from services.http.authentication import Authenticator
 from services.http.client_limits import PREVIEW_LIMITS, STREAM_LIMITS, ClientLimits, limit_clients
@@ -147,13 +148,19 @@ def _http_application(
         title="Diffuscope",
         version=version("diffuscope"),
         lifespan=lifespan,
-        openapi_url="/api/openapi.json",
+        openapi_url=None,  # FastAPI would serve it past the dependencies
         docs_url=None,
         redoc_url=None,
         dependencies=[Depends(access_required(authenticator, rates))],
         responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
     )
     register_error_handlers(app)
+
+    @app.get("/api/openapi.json", include_in_schema=False)
+    def openapi() -> JSONResponse:
+        return JSONResponse(app.openapi())
+
+    app.add_middleware(AdmittedAnswers, answer=problem_response)
     app.add_middleware(HeadRequests)
     app.add_middleware(CrossOriginProtection, names=host_names, answer=problem_response)
     app.add_middleware(BodyLimit, exempt=frozenset({UPLOAD_PATH}), answer=problem_response)

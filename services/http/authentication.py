@@ -74,9 +74,12 @@ class Authenticator:
         self.logins.confirm(token)
 
     def change_secret(self, token: str | None, secret: str, new: str, peer: Peer) -> str:
-        """Give the user of a login a new secret; return the token of the login that replaces all earlier ones."""
+        """Give the user of a login a new secret; return the token of the login that replaces all earlier ones.
+
+        SecretWrong or SignInLockedOut; LoginRequired if an administrator has changed the user meanwhile.
+        """
         user = self._verified(self._own_name(token), secret, peer)
-        return self.logins.begin(self.users.change(user.name, secret=new))
+        return self.logins.begin(self.users.change(user.name, secret=new, generation=user.generation))
 
     def set_up(self, code: str, name: str, secret: str, peer: Peer) -> str:
         """Create the first administrator, who has every role, and return the token of a login.

@@ -12,7 +12,7 @@ from services.identity.users import User, UserTable
 IDLE_LOCK_S = 300.0
 MAX_LOGIN_S = 12 * 3600.0
 CONFIRMED_S = 300.0  # after typing the secret, actions with a risk need no further confirmation
-MAX_LOGINS = 100  # the oldest end first
+MAX_LOGINS = 20  # of one user; the oldest end first
 
 
 @dataclass
@@ -41,7 +41,8 @@ class Logins:
         token, now_s = secrets.token_urlsafe(32), self._clock.now_s()
         with self._lock:
             self._logins[_digest(token)] = _Login(user.name, user.generation, now_s, now_s, now_s)
-            for oldest in list(self._logins)[:-MAX_LOGINS]:
+            of_user = [digest for digest, login in self._logins.items() if login.name == user.name]
+            for oldest in of_user[:-MAX_LOGINS]:
                 del self._logins[oldest]
         return token
 

@@ -19,7 +19,7 @@ from argon2.exceptions import InvalidHashError, VerificationError
 
 from device import atomic_io
 from device.errors import InputError, StoreError
-from services.errors import RecordNotFound, StoreDamaged
+from services.errors import LoginRequired, RecordNotFound, StoreDamaged
 from services.records import digested_json
 from services.records.json_values import JsonValue
 
@@ -27,6 +27,7 @@ Role = Literal["screener", "reader", "technician", "administrator"]
 ROLES: tuple[Role, ...] = get_args(Role)
 FOLDER, TABLE, BEGUN, SETUP_CODE = "access", "users.json", "users-begun", "setup-code"
 MAX_USERS, MAX_NAME, MAX_SECRET = 200, 40, 200
+GENERATION_BITS = 48  # of the random number at which the generations of a new user begin
 PIN_DIGITS, MIN_PASSPHRASE = 6, 10  # characters; a PIN may have more digits
 CODE_LETTERS, CODE_LENGTH = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789", 8  # 40 bits; without I, O, 0 and 1
 # The least memory that OWASP recommends for argon2id, about 0.1 s on a laptop; a PIN needs the lock-out beside it.
@@ -39,6 +40,7 @@ TABLE_REMEDY = "Restore the users from a backup, or call the technician. No user
 class User:
     """A user: unique name, roles, and `generation`, which grows with each change and ends the logins before it.
 
+    It begins at a random number: logins of a removed user stay ended when the name is given again.
     `is_demo`: the user of a simulated head before the first real user; it is in no table.
     """
 
@@ -95,7 +97,7 @@ class UserTable:
     def add(self, name: str, secret: str, roles: Iterable[Role]) -> User:
         """Add a user; InputError for an invalid or used name, a weak secret, or a first user without administration."""
         name = _checked_name(name)
-        entry = _Entry(User(name, _checked_roles(roles)), _hashed(secret))
+        entry = _Entry(User(name, _checked_roles(roles), secrets.randbits(GENERATION_BITS)), _hashed(secret))
         with self._changed() as entries:
             if _key(name) in entries:
                 raise InputError(f"{name} is a user already", "Choose another name, or give this user a new PIN.")
@@ -104,11 +106,22 @@ class UserTable:
             entries[_key(name)] = entry
         return entry.user
 
-    def change(self, name: str, secret: str | None = None, roles: Iterable[Role] | None = None) -> User:
-        """Give a user a new secret or other roles, which ends its logins; RecordNotFound if unknown, InputError."""
+    def change(
+        self,
+        name: str,
+        secret: str | None = None,
+        roles: Iterable[Role] | None = None,
+        generation: int | None = None,
+    ) -> User:
+        """Give a user a new secret or other roles, which ends its logins; RecordNotFound if unknown, InputError.
+
+        LoginRequired if `generation` is given and the user has changed since.
+        """
         hashed = None if secret is None else _hashed(secret)
         with self._changed() as entries:
             entry = _known(entries, name)
+            if generation not in (None, entry.user.generation):
+                raise LoginRequired(f"{entry.user.name} was changed meanwhile")
             checked = entry.user.roles if roles is None else _checked_roles(roles)
             user = replace(entry.user, roles=checked, generation=entry.user.generation + 1)
             entries[_key(name)] = _Entry(user, hashed or entry.secret)

@@ -7,10 +7,7 @@ Both files are untrusted input: they are read completely, up to a size limit, an
 only the id of an update that the updater itself found.
 """
 
-import io
 import json
-import os
-import stat
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal, Self
@@ -19,13 +16,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from device import atomic_io
 from device.errors import DiffuscopeError
+from device.user_files import read_plain_file
 from services.errors import UpdateRequestInvalid
 
 STATE_FILE, REQUEST_FILE = "journal.json", "request.json"
 TABLET = "tablet"  # subfolder of the updater's folder for files uploaded by the page
 UPLOAD = "update.raucb"  # its only file
 MAX_STATE_BYTES, MAX_REQUEST_BYTES = 65_536, 1_000
-OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 WORLD_READABLE = 0o644  # independent of the umask: the reader is another user
 
 State = Literal[
@@ -122,7 +119,7 @@ class UpdateRequest(BaseModel):
 def read_state(folder: Path) -> UpdateState:
     """Return the stored state; UpdateState() if it is missing, unreadable or invalid, since it is informative only."""
     try:
-        return UpdateState.model_validate_json(_read(folder / STATE_FILE, MAX_STATE_BYTES))
+        return UpdateState.model_validate_json(read_plain_file(folder / STATE_FILE, MAX_STATE_BYTES))
     except (OSError, ValidationError):
         return UpdateState()
 
@@ -144,7 +141,7 @@ def take_request(folder: Path) -> UpdateRequest | None:
     """
     path = folder / REQUEST_FILE
     try:
-        content = _read(path, MAX_REQUEST_BYTES)
+        content = read_plain_file(path, MAX_REQUEST_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -178,17 +175,6 @@ def stage_of(entry: UpdateState, runs: str, boot: str) -> str:
         case "committed" if entry.version != runs:
             return "none"
     return entry.state
-
-
-def _read(path: Path, most_bytes: int) -> bytes:
-    """Return the content of a regular file, at most `most_bytes`; OSError for any other or a longer file."""
-    with io.FileIO(os.open(path, OPEN_FLAGS), closefd=True) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise OSError(0, "it is no plain file")
-        content = file.read(most_bytes + 1)
-    if len(content) > most_bytes:
-        raise OSError(0, f"it is longer than {most_bytes} bytes")
-    return content
 
 
 def _put(path: Path, note: BaseModel) -> None:

@@ -16,10 +16,10 @@ import httpx
 
 from device import atomic_io
 from device.clock import Clock
-from device.user_files import files_in
+from device.user_files import OPEN_FLAGS, files_in
 from services.errors import UpdateDamaged, UpdateNoRoom, UpdateNotFound, UpdateSourceRemoved, UpdateUnreachable
 from services.update.channel import Offer
-from services.update.ipc import OPEN_FLAGS, UPLOAD, FoundUpdate
+from services.update.ipc import UPLOAD, FoundUpdate
 
 CHUNK_BYTES = 1 << 20
 COPIED_BUNDLE, DOWNLOADED_BUNDLE = ".copy.raucb", "update.raucb"  # copied from a drive or an upload; downloaded

@@ -9,8 +9,10 @@ from typing import Any
 
 import httpx
 import pytest
+from fastapi.responses import PlainTextResponse
 
 from device.clock import VirtualClock
+from services.delivery.uploader import HttpsUploader, UploadSettings
 from services.errors import AuthenticationError
 from services.health.clock_request import REQUEST
 from services.http.access import ACCESS, Access
@@ -22,6 +24,8 @@ from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
 from services.identity.users import ROLES, Role
 from services.records.audit_log import AuditLog
+from services.records.capture_journal import CaptureJournal, InterruptedCapture
+from services.records.capture_store import CaptureStore
 from tests.golden import http_transcript
 from tests.journey.conftest import Rig, read_event_stream
 
@@ -79,7 +83,8 @@ def filled(path: str) -> str:
 
 
 def test_every_operation_is_in_the_table_and_nothing_else_is() -> None:
-    served = operations(http_transcript.openapi())
+    """The document names each endpoint but itself."""
+    served = [*operations(http_transcript.openapi()), ("GET", "/api/openapi.json")]
     assert {operation for operation in ACCESS if " /api/" in operation} == {" ".join(one) for one in served}
 
 
@@ -98,7 +103,7 @@ def test_each_operation_admits_its_roles_and_refuses_all_others(rig: Rig) -> Non
     clock.sleep(IDLE_LOCK_S)
     assert ended.user(expired, OWN_SCREEN) is ended.user(revoked, OWN_SCREEN) is None
     left_out = [("GET", "/api/events"), ("DELETE", "/api/login")]  # a stream; and the end of the login that is tried
-    pages = [("GET", "/"), ("GET", "/technician"), ("GET", "/web/{name:path}")]
+    pages = [("GET", path) for path in ("/", "/technician", "/web/{name:path}", "/api/openapi.json")]
     for verb, path in [one for one in operations(rig.app.openapi()) if one not in left_out] + pages:
         rule = ACCESS[f"{verb} {path}"]
         others = {"none": None, "guessed": "a" * 43, "expired": expired, "revoked": revoked}
@@ -122,11 +127,16 @@ def admits(rule: Access, name: str) -> bool:
 
 def test_an_operation_without_a_row_is_refused_at_run_time(rig: Rig) -> None:
     rig.app.add_api_route("/api/unknown", lambda: "served", methods=["GET"])
+    rig.app.add_route("/api/plain", lambda _: PlainTextResponse("served"))
+    rig.app.mount("/api/mounted", PlainTextResponse("served"))
     try:
-        answer = ask(rig.app, "GET", "/api/unknown", tokens(rig)["administrator"])
-        assert (answer.status_code, answer.json()["code"]) == (403, "access.role")
+        for path in ("/api/unknown", "/api/plain", "/api/mounted/"):
+            for verb in ("GET", "HEAD"):
+                answer = ask(rig.app, verb, path, tokens(rig)["administrator"])
+                assert answer.status_code == 403
+                assert b"served" not in answer.content
     finally:
-        rig.app.router.routes.pop()
+        del rig.app.router.routes[-3:]
 
 
 def test_the_device_itself_reads_status_and_health_and_nothing_else(rig: Rig) -> None:
@@ -135,6 +145,50 @@ def test_the_device_itself_reads_status_and_health_and_nothing_else(rig: Rig) ->
         assert is_refused(ask(rig.app, "GET", path))
         assert is_refused(ask(rig.app, "GET", path, client=HERE, headers={"X-Forwarded-For": "10.42.0.7"}))
     assert is_refused(ask(rig.app, "GET", "/api/visits", client=HERE))
+
+
+def test_captures_are_told_to_users_who_may_read_them(build: Callable[..., Rig], tmp_path: Path) -> None:
+    """Interrupted captures and alerts in the status, and events; the device itself reads its status without a login."""
+    with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
+        CaptureJournal(store).begin(InterruptedCapture("20260301T120000-OD-ab", "OD"), "0" * 16)
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo)
+        add_users(rig)
+        rig.event_bus.publish("verdict", id="none", word="poor", code="shot.dark", numbers={})
+        rig.event_bus.publish("state", state="making")
+        signed_in = tokens(rig)
+        told = {name: bool(ask(rig.app, "GET", "/api/status", signed_in[name]).json()["swept"]) for name in ROLES}
+        assert told == {name: name != "administrator" for name in ROLES}
+        for token, is_told in ((None, False), (signed_in["screener"], True)):
+            assert bool(ask(rig.app, "GET", "/api/status", token, HERE).json()["swept"]) == is_told
+        for name in ROLES:
+            headers = {"Cookie": f"login={signed_in[name]}", "Host": "diffuscope.local", "Last-Event-ID": "0"}
+            stream = read_event_stream(rig.app, lambda got: got[-1:] and got[-1][2] == {"state": "making"}, headers)
+            kinds = {kind for _, kind, _ in asyncio.run(stream)}
+            assert ("verdict" in kinds) == (name != "administrator")
+
+
+def test_the_upload_queue_tells_patient_numbers_to_users_who_may_read_visits(
+    build: Callable[..., Rig], tmp_path: Path
+) -> None:
+    uploader = HttpsUploader(UploadSettings(address="https://127.0.0.1:9/", token=tmp_path / "none"))
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo, wait=False, carrier=uploader)
+        add_users(rig)
+        signed_in, keys = tokens(rig), iter("0123")
+
+        def post(path: str, verb: str = "POST", **body: str) -> dict[str, Any]:
+            answer = ask(rig.app, verb, path, signed_in["screener"], json={"key": next(keys) * 16, **body})
+            return dict(answer.json())
+
+        visit = post("/api/visits")
+        post(f"/api/visits/{visit['id']}", "PATCH", field="consent", value="declined")
+        post(f"/api/visits/{visit['id']}/finish")
+        for name in ROLES:
+            (waiting,) = ask(rig.app, "GET", "/api/upload-queue", signed_in[name]).json()["visits"]
+            assert waiting["number"] == (visit["number"] if name in ("screener", "reader") else None)
+        retried = ask(rig.app, "POST", "/api/upload-queue/retry", signed_in["technician"], json={"key": "9" * 16})
+        assert [one["number"] for one in retried.json()["visits"]] == [None]
 
 
 @pytest.fixture

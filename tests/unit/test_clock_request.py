@@ -1,5 +1,6 @@
 """Time of a tablet: accepted once, where nothing better is there, forward but for an administrator, and recorded."""
 
+import os
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from device.clock import VirtualClock
 from services.errors import ClockBackwards, ClockRefused
 from services.health.clock_request import REQUEST, needs_time, request_time, take_request
-from services.health.clock_source import clock_state
+from services.health.clock_source import BROWSER_SOURCE, clock_state
 
 CLOCK = VirtualClock(elapsed_s=60 * 86_400.0)
 NOW = datetime(2026, 11, 25, 9, 30, tzinfo=timezone(timedelta(hours=5, minutes=30)))
@@ -80,3 +81,29 @@ def test_an_invalid_request_is_removed_and_sets_nothing(root: Path, content: str
     with pytest.raises((ValueError, TypeError)):
         take_request(lambda _: pytest.fail("the clock was set"), VirtualClock(), root)
     assert not (root / REQUEST).exists()
+
+
+@pytest.mark.parametrize("kind", ["link", "long", "pipe"])
+def test_the_unit_of_root_follows_no_link_and_reads_no_long_request(root: Path, kind: str) -> None:
+    """The instrument may write the folder of the request."""
+    secret = root / "secret"
+    secret.write_text(NOW.isoformat())
+    match kind:
+        case "link":
+            (root / REQUEST).symlink_to(secret)
+        case "long":
+            (root / REQUEST).write_text(" " * 1_000 + NOW.isoformat())
+        case "pipe":
+            os.mkfifo(root / REQUEST)
+    with pytest.raises(OSError, match=r"symbolic|longer|plain"):
+        take_request(lambda _: pytest.fail("the clock was set"), CLOCK, root)
+    assert not list((root / REQUEST).parent.iterdir())
+
+
+def test_the_unit_of_root_writes_its_source_over_no_other_file(root: Path) -> None:
+    victim = root / "victim"
+    (root / BROWSER_SOURCE).symlink_to(victim)
+    request_time(NOW, CLOCK, root=root)
+    take_request(lambda _: None, CLOCK, root)
+    assert not victim.exists()
+    assert (root / BROWSER_SOURCE).stat(follow_symlinks=False).st_mode & 0o777 == 0o644

@@ -10,7 +10,7 @@ from device.errors import InputError, StoreReadOnly
 from services import cli
 from services.errors import ConfirmationRequired, LoginRequired, RecordNotFound, StoreDamaged
 from services.identity.lock_out import MAX_OWN_SCREEN_WAIT_S, MAX_WAIT_S, LockOut
-from services.identity.logins import CONFIRMED_S, IDLE_LOCK_S, MAX_LOGIN_S, Logins
+from services.identity.logins import CONFIRMED_S, IDLE_LOCK_S, MAX_LOGIN_S, MAX_LOGINS, Logins
 from services.identity.users import UserTable
 
 PIN, PASSPHRASE = "274913", "a blue boat in May"
@@ -176,6 +176,35 @@ def test_a_login_ends_idle_by_age_by_sign_out_and_with_a_change_of_its_user(
         assert logins.user(lasting, acts=True) is not None
     clock.sleep(IDLE_LOCK_S / 2)
     assert logins.user(lasting, acts=True) is None
+
+
+def test_a_login_of_a_removed_user_stays_ended_when_the_name_is_given_again(
+    users: UserTable, clock: VirtualClock
+) -> None:
+    logins = Logins(users, clock)
+    token = logins.begin(users.add("Ravi", PIN, ["reader"]))
+    users.remove("Ravi")
+    users.add("Ravi", PASSPHRASE, ["technician"])
+    assert logins.user(token) is None
+
+
+def test_a_reset_by_an_administrator_is_not_overwritten_by_the_users_own_change(users: UserTable) -> None:
+    """The reset comes between the check of the old PIN and the change to the new one."""
+    asha = users.verify("Asha", PIN)
+    assert asha is not None
+    users.change("Asha", secret=PASSPHRASE)
+    with pytest.raises(LoginRequired):
+        users.change("Asha", secret="567390", generation=asha.generation)
+    assert users.verify("Asha", PASSPHRASE) is not None
+
+
+def test_many_logins_of_one_user_end_none_of_another(users: UserTable, clock: VirtualClock) -> None:
+    logins = Logins(users, clock)
+    asha, ravi = users.users()[0], users.add("Ravi", PIN, ["reader"])
+    kept = logins.begin(asha)
+    tokens = [logins.begin(ravi) for _ in range(150)]
+    assert logins.user(kept) == asha
+    assert [logins.user(token) for token in (tokens[0], tokens[-MAX_LOGINS])] == [None, ravi]
 
 
 def test_a_risk_needs_the_secret_of_the_last_minutes(users: UserTable, clock: VirtualClock) -> None:

@@ -6,6 +6,7 @@ from fastapi import APIRouter, Header, Request
 from pydantic_core import to_json
 
 from device.errors import StoreError
+from services.http.access import may
 from services.http.media import EventStream
 from services.http.schemas.captures import CaptureAnswer, capture_answer
 from services.http.schemas.events import SERVER_SENT_EVENT, ServerSentEvent
@@ -27,14 +28,16 @@ def event_router(arbiter: HeadArbiter) -> APIRouter:
         stored capture. `failed`: an error (`code`, `message`, `remedy`). `accuracy`: progress of the accuracy explorer.
         `notice`: an alert, by its `code`, is active from now on, with its values (`n`, `date`, `wait_s`), or ended
         (`over`); alerts that are active already are part of the status. `calibration`: new findings of the calibration
-        monitor. With `Last-Event-ID` the stream resumes after that event. It ends with
-        the login. 503 if too many streams are open.
+        monitor. With `Last-Event-ID` the stream resumes after that event. Events with the id of a capture come to users
+        who may read captures. The stream ends with the login. 503 if too many streams are open.
         """
 
         async def lines() -> AsyncIterator[str]:
             async for event in arbiter.context.event_bus.subscribe(last_event_id):
-                if not request.state.is_admitted():
+                if not may(request, "GET /api/events"):
                     return
+                if "id" in event.data and not may(request, "GET /api/captures/{id}"):
+                    continue
                 if event.kind != "kept":
                     yield sse_text(event)
                 elif (capture := _readable(arbiter.context.store, str(event.data["id"]))) is not None:

@@ -2,7 +2,7 @@
 
 from importlib.metadata import version
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 
 from device.head import kind_of
 from device.recon.model.field_of_view import field_radius_px
@@ -11,6 +11,7 @@ from services.health.alert_monitor import AlertMonitor
 from services.health.alerts import is_age_warning
 from services.health.checks import picture_times, run_checks
 from services.health.collector import collect_status
+from services.http.access import may
 from services.http.control_lease import ControlLease
 from services.http.problem_responses import problem_body
 from services.http.schemas.status import (
@@ -41,14 +42,19 @@ def status_router(
     router = APIRouter()
 
     @router.get("/api/status")
-    def status() -> StatusAnswer:
+    def status(request: Request) -> StatusAnswer:
         """Return the status of the instrument.
 
         State, head, free space in captures and visits, holder of the control lease, active alerts, interrupted
         captures, and the counts of the upload queue. `problem` is the error that prevents captures now, or null.
-        `notices`: remedies of the failed findings of the calibration monitor, without the age warning.
+        `notices`: remedies of the failed findings of the calibration monitor, without the age warning. Interrupted
+        captures, and alerts with the id of a capture, are told to users who may read captures.
         """
-        return status_answer(arbiter, repository, lease, alerts, upload_worker)
+        answer = status_answer(arbiter, repository, lease, alerts, upload_worker)
+        if may(request, "GET /api/captures/{id}"):
+            return answer
+        standing = [alert for alert in answer.standing if alert.id is None]
+        return answer.model_copy(update={"swept": [], "standing": standing})
 
     @router.get("/api/health")
     def health() -> HealthAnswer:

@@ -14,11 +14,12 @@ class UploadRetry(IdempotentRequest):
 class WaitingVisit(ResponseBody):
     """A visit in the upload queue: id, patient number, time of its finish, size, attempts, and the last error.
 
-    `failing_since`: time of the first failed attempt, or null. `stuck`: the visit needs help from a user.
+    `number`: null for a user who may not read visits. `failing_since`: time of the first failed attempt, or null.
+    `stuck`: the visit needs help from a user.
     """
 
     visit: str
-    number: str
+    number: str | None
     since: Timestamp
     size_bytes: int
     tries: int
