@@ -208,7 +208,7 @@ def may(request: Request, operation: str) -> bool:
     """Return whether the user of a request may also send `operation`, a key of `ACCESS`, now."""
     try:
         return bool(request.state.is_admitted(operation))
-    except StoreDamaged:  # nobody gets in; the device itself still reads its status
+    except StoreDamaged:  # no user is admitted; the device itself still reads its status
         return False
 
 

@@ -157,8 +157,8 @@ def test_captures_are_told_to_users_who_may_read_them(build: Callable[..., Rig],
         rig.event_bus.publish("verdict", id="none", word="poor", code="shot.dark", numbers={})
         rig.event_bus.publish("state", state="making")
         signed_in = tokens(rig)
-        told = {name: bool(ask(rig.app, "GET", "/api/status", signed_in[name]).json()["swept"]) for name in ROLES}
-        assert told == {name: name != "administrator" for name in ROLES}
+        shown = {name: bool(ask(rig.app, "GET", "/api/status", signed_in[name]).json()["swept"]) for name in ROLES}
+        assert shown == {name: name != "administrator" for name in ROLES}
         for token, is_told in ((None, False), (signed_in["screener"], True)):
             assert bool(ask(rig.app, "GET", "/api/status", token, HERE).json()["swept"]) == is_told
         for name in ROLES:

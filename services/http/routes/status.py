@@ -48,7 +48,7 @@ def status_router(
         State, head, free space in captures and visits, holder of the control lease, active alerts, interrupted
         captures, and the counts of the upload queue. `problem` is the error that prevents captures now, or null.
         `notices`: remedies of the failed findings of the calibration monitor, without the age warning. Interrupted
-        captures, and alerts with the id of a capture, are told to users who may read captures.
+        captures, and alerts with the id of a capture, are for users who may read captures.
         """
         answer = status_answer(arbiter, repository, lease, alerts, upload_worker)
         if may(request, "GET /api/captures/{id}"):
