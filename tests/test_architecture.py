@@ -490,7 +490,6 @@ def test_data_is_written_private_whatever_the_umask() -> None:
     public = "in a folder of every boot, for services of other users"
     allowed = {
         "device/config/marked_files.py: write_bytes": "a picture of a command, where its user says",
-        "services/health/clock_request.py: write_text": public,
         "services/identity/apply_at_boot.py: write_text": public,
         "services/identity/apply_at_boot.py: mkdir": public,
         "services/identity/apply_settings.py: mkdir": public,

@@ -105,6 +105,7 @@ UNRECORDED = frozenset(
         "GET /api/technician/backup",
         "GET /api/technician/removal",
         "GET /api/update",
+        "GET /api/openapi.json",
     }
 )
 Append = Callable[..., None]

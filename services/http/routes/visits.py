@@ -1,9 +1,12 @@
 """Endpoints of patients and visits: read, change, and the control lease of the screens."""
 
+import re
 from collections.abc import Callable
 from datetime import date
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
+from pydantic import BeforeValidator
 
 from services.http.access import signed_in
 from services.http.control_lease import ControlLease
@@ -27,6 +30,15 @@ from services.records.row_validation import reading_record, without_damaged
 from services.records.visit import Visit
 from services.records.visit_document import VisitDocument, visit_document
 from services.records.visit_repository import VisitRepository
+
+ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+
+
+def iso_date(text: str | None) -> str | None:
+    """Return the text of a date, YYYY-MM-DD; ValueError for any other, as a number of seconds."""
+    if text is not None and not ISO_DATE.fullmatch(text):
+        raise ValueError("a date is written YYYY-MM-DD")
+    return text
 
 
 def visits_router(
@@ -54,7 +66,7 @@ def _read_router(repository: VisitRepository) -> APIRouter:
 
     @router.get("/api/visits")
     def visits(
-        day: date | None = None,
+        day: Annotated[date | None, BeforeValidator(iso_date)] = None,
         open: bool | None = None,
         q: str | None = Query(None, max_length=20, pattern="^[0-9A-Za-z-]*$"),
         limit: int = Query(50, ge=1, le=500),
