@@ -12,11 +12,15 @@ from threading import Thread
 
 @dataclass
 class Site:
-    """Folder on a web server; `cuts` are the numbers of bytes after which the next transfers abort."""
+    """Folder on a web server; `cuts` are the numbers of bytes after which the next transfers abort.
+
+    `moved`: URLs to which requests of a name are redirected.
+    """
 
     url: str
     files: dict[str, bytes]
     cuts: list[int] = field(default_factory=list)
+    moved: dict[str, str] = field(default_factory=dict)
     requested_ranges: list[str] = field(default_factory=list)
     supports_ranges: bool = True
 
@@ -56,6 +60,11 @@ def serve(certificate: Path, key: Path) -> Iterator[Site]:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            if (moved := site.moved.get(self.path.lstrip("/"))) is not None:
+                self.send_response(302)
+                self.send_header("Location", moved)
+                self.end_headers()
+                return
             content = site.files.get(self.path.lstrip("/"))
             site.requested_ranges.append(self.headers.get("Range", "all"))
             if content is None:

@@ -48,7 +48,7 @@ from services.instrument.press_exposure import Exposure, LiveFrame, Taken, expos
 from services.instrument.time_budget import has_time_for_cylinder, is_of_one_frame
 from services.records.blobs import FileContent
 from services.records.capture import BUDGET_S, NO_METHOD, Capture, RecordOrigin
-from services.records.capture_target import OTHER_COLOURS
+from services.records.capture_target import OTHER_COLOURS, Permit, permit_test_picture
 
 log = logging.getLogger(__name__)
 
@@ -98,6 +98,7 @@ class CapturePipeline:
         budget_s: float = BUDGET_S,
         taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
         looked: Looked = lambda picture, simulated: None,
+        permit: Permit = permit_test_picture,
     ) -> Exposure:
         """Return a dark frame, up to `exposures(count)` lit ones and one in each of `colours`, as `expose_press`.
 
@@ -115,6 +116,7 @@ class CapturePipeline:
             count=self.exposures(count),
             colours=able,
             field=field,
+            permit=permit,
         )
         if self.bursts is None:
             exposure = run(taken=taken)

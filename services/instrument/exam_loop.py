@@ -173,6 +173,7 @@ class ExamLoop:
             budget_s=budget_s,
             taken=FrameSink(writer, shared, head.spec.light.colour),
             looked=partial(self._events.quick_look, press, id, is_exposing=True),
+            permit=target.permit,
         )
         return replace(self._assessed(press, id, taken_at, exposure), written=writer.finish, budget_s=budget_s)
 

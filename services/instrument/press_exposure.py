@@ -17,8 +17,10 @@ from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.recon.burst import JoinedFrame
 from device.recon.burst_reconstructor import PreparedFrame
 from device.values import ChannelUse, Colour, Counts, ExposureSettings, Eye, Frame, Illumination
+from services.errors import RequestRefused
 from services.instrument.frame_preparation import AssessedFrame, JoinedBurst
 from services.records.capture import OtherColour
+from services.records.capture_target import Permit, permit_test_picture
 
 log = logging.getLogger(__name__)
 
@@ -94,6 +96,7 @@ def expose_press(
     taken: Taken = lambda frame, dose_j_per_cm2, exposed_s: None,
     split: ExposureSplit = WHOLE,
     lit_taken: Callable[[], None] = lambda: None,
+    permit: Permit = permit_test_picture,
 ) -> Exposure:
     """Return a dark frame, the frames of up to `count` lit exposures, and one in each of `colours`, in this order.
 
@@ -102,14 +105,14 @@ def expose_press(
     up to a lower limit. There are fewer lit frames if the guard permits no light for so long. A colour that cannot be
     taken is missing, with the reason; the lit frames are kept. `field`: field of view of the programme, to which a
     simulated eye turns. `taken` is called with each frame after its read-out and must return at once: the lamp may be
-    on. So must `lit_taken`, which is called after the last lit frame.
+    on. So must `lit_taken`, which is called after the last lit frame. `permit` is called before each light.
 
-    Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not or
-    cannot be on, LightCut if the guard has ended the first lit frame, CameraMissing or CameraStalled if the camera
-    fails before the last lit one. The lamp is off at every exit.
+    Raises the error of `permit`, that of `Head.check` if a part of the head is not ready, LightLimit or LightFault if
+    the lamp may not or cannot be on, LightCut if the guard has ended the first lit frame, CameraMissing or
+    CameraStalled if the camera fails before the last lit one. The lamp is off at every exit.
     """
     head.check()
-    run = _Exposing(head, eyes, clock, in_visit, taken)
+    run = _Exposing(head, eyes, clock, in_visit, taken, permit)
     part = ExposureSettings(head.spec.camera.exposure_s if split.part_s is None else split.part_s)
     announce_eye(head, eyes, field)
     head.camera.prepare(part)
@@ -141,12 +144,15 @@ class _Exposing:
     `overhead_s`: what a frame of the last light took longer than its exposure, at most.
     """
 
-    def __init__(self, head: Head, eyes: tuple[Eye, ...], clock: Clock, in_visit: bool, taken: Taken) -> None:
+    def __init__(
+        self, head: Head, eyes: tuple[Eye, ...], clock: Clock, in_visit: bool, taken: Taken, permit: Permit
+    ) -> None:
         self._head = head
         self._eyes = eyes
         self._clock = clock
         self._in_visit = in_visit
         self._taken = taken
+        self._permit = permit
         self.begin_s = self._reported_s = clock.now_s()
         self.overhead_s = 0.0
         self._before_j_per_cm2 = head.light.total_j_per_cm2
@@ -173,6 +179,7 @@ class _Exposing:
 
     def lit(self, light: Illumination, shot: ExposureSettings, count: int = 1, parts: int = 1) -> tuple[Frame, ...]:
         """Return up to `count` exposures in one light, each split into `parts` frames of `shot`."""
+        self._permit()
         self.overhead_s = 0.0
         self._reported_s = self._clock.now_s()
         return burst(
@@ -198,6 +205,8 @@ class _Exposing:
             try:
                 self._head.camera.prepare(whole)  # in the dark: a sensor may take some frames to change its exposure
                 (taken[colour],) = self.lit(self._head.light.hazard.brightest(colour), whole)
+            except RequestRefused:  # no consent any more, so no picture
+                raise
             except DiffuscopeError as error:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})
                 missing.append(ChannelUse(colour, None, reason=error.message, code=error.code))

@@ -25,7 +25,7 @@ class CaptureTarget:
 
     `tries`: number of earlier captures of the slot; `retakes`: permitted number of retakes. `write_rows` adds rows in
     the transaction that stores the capture, whose record holds `request`, the reference of the press
-    (`IdempotentRequests.reference`). `permit` is called right before the light and raises ConsentMissing or
+    (`IdempotentRequests.reference`). `permit` is called right before each light and raises ConsentMissing or
     ConsentDeclined if the visit does not allow light. `frames`: number of exposures in the picture's colour, 1 to
     FRAMES, each of which may be split into several frames; not used for a resumed capture. `colours`: other colours of
     light, of which one frame each is taken.

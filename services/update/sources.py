@@ -164,9 +164,9 @@ class UpdateServer:
         """Request a file from byte `there` on; httpx.HTTPStatusError for an error status (400 or above)."""
         headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={there}-"} if there else {})
         url = f"{self._at}/{name}"  # https only: UpdateSettings
-        timeout = READ_TIMEOUT_S
+        timeout, hooks = READ_TIMEOUT_S, {"request": [_refuse_plain]}
         with (
-            httpx.Client(verify=self._trust, timeout=timeout, follow_redirects=True) as client,
+            httpx.Client(verify=self._trust, timeout=timeout, follow_redirects=True, event_hooks=hooks) as client,
             client.stream("GET", url, headers=headers) as answer,
         ):
             answer.raise_for_status()
@@ -182,6 +182,12 @@ class UpdateServer:
             raise UpdateUnreachable(f"{self._at}/{name}: {answer.status_code} {answer.reason_phrase}") from error
         except (OSError, httpx.HTTPError) as error:
             raise UpdateUnreachable(f"{self._at}/{name}: {error}", _remedy(error)) from error
+
+
+def _refuse_plain(request: httpx.Request) -> None:
+    """Raise httpx.UnsupportedProtocol for a request without TLS, to which a server has redirected."""
+    if request.url.scheme != "https":
+        raise httpx.UnsupportedProtocol(f"only https is followed, not {request.url}")
 
 
 def _remedy(error: BaseException | None) -> str | None:

@@ -101,6 +101,26 @@ def test_pending_capture_gets_no_light_after_consent_is_withdrawn(make_rig: Make
     assert rig.exam.capture_journal.interrupted == ()
 
 
+def test_the_red_light_of_a_press_stays_off_after_consent_is_withdrawn(make_rig: MakeRig) -> None:
+    """The consent is read before each light of a press, not once."""
+    rig = make_rig(tinted=("green", "red"))
+    visit = visit_with_consent(rig)["id"]
+    wait_until_idle(rig)
+    order = {"key": secrets.token_hex(8), "field": "consent", "value": "declined"}
+
+    async def scenario(client: httpx.AsyncClient) -> httpx.Response:
+        rig.block_exposures()
+        press = asyncio.create_task(client.post("/api/captures", json=capture_request(visit)))
+        await asyncio.to_thread(rig.wait_for_blocked_exposure)  # in the picture's colour
+        assert (await client.patch(f"/api/visits/{visit}", json=order)).status_code == 200
+        rig.clock.gate.set()
+        return await press
+
+    refused(rig.ask(scenario), "consent.declined")
+    assert (rig.store.captures(), rig.world.illumination) == ([], None)
+    assert rig.exam.capture_journal.interrupted == ()
+
+
 def test_preview_of_another_visit_continues_when_consent_is_withdrawn(make_rig: MakeRig) -> None:
     rig = make_rig()
     first, second = (visit_with_consent(rig)["id"] for _ in range(2))

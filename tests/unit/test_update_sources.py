@@ -120,6 +120,16 @@ def test_complete_download_is_not_requested_again(site: Site, keys: Path, tmp_pa
     assert (site.requested_ranges, list(tmp_path.glob("*.part"))) == ([], [])
 
 
+def test_a_redirect_is_followed_to_https_only(site: Site, keys: Path) -> None:
+    site.files = {"elsewhere": b"signed"}
+    web = UpdateServer(site.url, keys / "web.crt", VirtualClock())
+    site.moved = {"channel.cms": f"{site.url}/elsewhere"}
+    assert web.read_small_file("channel.cms") == b"signed"
+    site.moved = {"channel.cms": "http://localhost:9/channel.cms"}
+    with pytest.raises(UpdateUnreachable, match="only https"):
+        web.read_small_file("channel.cms")
+
+
 def test_untrusted_certificate_has_a_remedy_about_the_clock(site: Site, tmp_path: Path) -> None:
     """The usual cause on a device without a battery-backed clock: the certificate seems expired."""
     with pytest.raises(UpdateUnreachable) as caught:
