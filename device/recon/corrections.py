@@ -14,7 +14,7 @@ import numpy as np
 from device.errors import FrameError
 from device.recon.assessment.quality_figures import is_banded, states_misfit
 from device.recon.durations import DurationEstimate, Pace
-from device.recon.estimation.flicker import FlickerFinder
+from device.recon.estimation.flicker import MIN_RATIO, SPOT_MIN_RATIO, FlickerFinder
 from device.recon.estimation.ghost import Ghost, share_of
 from device.recon.estimation.refraction.estimator import NoRefraction
 from device.recon.estimation.refraction.notation import doubt_of, widened
@@ -134,7 +134,8 @@ class Corrections:
         solve_behind_pupil: SolveBehindPupil | None,
         pace: Pace,
     ) -> None:
-        self.flicker = FlickerFinder(dark_dn, calibration.sensor.white_dn)
+        min_ratio = SPOT_MIN_RATIO if calibration.has_spots else MIN_RATIO
+        self.flicker = FlickerFinder(dark_dn, calibration.sensor.white_dn, min_ratio)
         self._white_dn = calibration.sensor.white_dn
         self._has_spots = calibration.has_spots
         self._shape = shape

@@ -22,6 +22,7 @@ DEGREE = 12  # of the polynomial that holds the steady profile of the rows
 MIN_CYCLES = 5  # over the lit rows: fewer are shading, too
 MIN_AMPLITUDE = 0.004  # of the light: clean frames up to 0.002
 MIN_RATIO = 30.0  # of the line to its neighbours in the spectrum: clean frames up to 10, reflexes 18
+SPOT_MIN_RATIO = 10.0  # behind lenslets, whose rows show the retina: a clean frame 4.5, bands of 5 % 26
 NEIGHBOURS = 40  # cycles over the lit rows
 HARMONICS = 24  # the ninth of a triangle still has 1 % of its amplitude
 FEW_HARMONICS = 3  # with which the period is found
@@ -47,10 +48,13 @@ class _Profile(NamedTuple):
 
 
 class FlickerFinder:
-    """Search for flicker in frames with this dark frame, (rows, cols) or (1, cols), and this white level."""
+    """Search for flicker in frames with this dark frame, (rows, cols) or (1, cols), and this white level.
 
-    def __init__(self, dark: Image, white_dn: float) -> None:
-        self._dark, self._white_dn = dark, white_dn
+    `min_ratio`: of the line of the row means to its neighbours.
+    """
+
+    def __init__(self, dark: Image, white_dn: float, min_ratio: float = MIN_RATIO) -> None:
+        self._dark, self._white_dn, self._min_ratio = dark, white_dn, min_ratio
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> SteadyFrame | None:
         """Return a frame, (rows, cols) or (rows, cols, 3), without its flicker; None if its row means show none.
@@ -63,7 +67,7 @@ class FlickerFinder:
         others = tuple(range(1, counts.ndim))
         seen = np.isfinite(counts)
         light = np.where(seen, counts - offset, 0).sum(others, dtype=np.float64)
-        gain = row_gain(light / np.maximum(seen.sum(others), 1))
+        gain = row_gain(light / np.maximum(seen.sum(others), 1), self._min_ratio)
         if gain is None:
             return None
         steady = (counts - offset) / gain.astype(np.float32).reshape(-1, *(1 for _ in others)) + offset
@@ -72,16 +76,16 @@ class FlickerFinder:
         return SteadyFrame(np.asarray(steady, np.float32), float(gain.std()))
 
 
-def row_gain(light_dn: Series) -> Series | None:
+def row_gain(light_dn: Series, min_ratio: float = MIN_RATIO) -> Series | None:
     """Return the periodic gain of each row that the row means (rows,) show, mean about 1.
 
-    None without a narrow line in their spectrum.
+    None without a line in their spectrum that is `min_ratio` times its neighbours.
     """
     profile = _profile(light_dn)
     if profile is None:
         return None
     steady = np.linalg.lstsq(profile.polynomials, profile.log_light, rcond=None)[0]
-    cycles = _line(profile.log_light - profile.polynomials @ steady)
+    cycles = _line(profile.log_light - profile.polynomials @ steady, min_ratio)
     if cycles is None:
         return None
     gain = np.ones(len(light_dn))
@@ -101,14 +105,14 @@ def _profile(light_dn: Series) -> _Profile | None:
     return _Profile(first, np.log(light), polynomials)
 
 
-def _line(left: Series) -> float | None:
+def _line(left: Series, min_ratio: float) -> float | None:
     """Return the cycles over all rows of the strongest line in the spectrum of `left`; None if none is narrow."""
     rows = len(left)
     window = np.hanning(rows + 2)[1:-1]
     amplitude = np.abs(np.fft.rfft((left - np.average(left, weights=window)) * window, ZEROS * rows)) * 2 / window.sum()
     near = ndimage.median_filter(amplitude, ZEROS * NEIGHBOURS + 1)
     best = ZEROS * MIN_CYCLES + int(np.argmax(amplitude[ZEROS * MIN_CYCLES :]))
-    is_narrow = amplitude[best] >= max(MIN_AMPLITUDE, MIN_RATIO * near[best])
+    is_narrow = amplitude[best] >= max(MIN_AMPLITUDE, min_ratio * near[best])
     return best / ZEROS if is_narrow else None
 
 
