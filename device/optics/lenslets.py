@@ -97,8 +97,8 @@ def spots(
 ) -> Image:
     """Return the intensity on the sensor from one retinal point behind lenslets: float32 (n, n), the axis in n//2.
 
-    The sum is 1, less what a `beam` and black gaps take. `slope` is the tangent of the chief ray's angle at the iris
-    (right, down), at which the lenses' image surface is curved; (0, 0): on the axis. `seed` selects the flaws. Every
+    The sum is 1, less what a `beam`, black gaps and dust take. `slope` is the tangent of the chief ray's angle at the
+    iris (right, down), off the axis the lenses are stronger; (0, 0): on the axis. `seed` selects the flaws. Every
     pixel integrates over its whole area; lenses, and `lines` wavelengths across the bandwidth, add incoherently.
     """
     element = with_flaws(optics.element, flaws, seed)
@@ -177,7 +177,7 @@ def _cell(lens: _Lens, samples: _Samples) -> Floats:
 
 
 def _stops(lens: _Lens, samples: _Samples, beam: Beam | None) -> Floats | float:
-    """Return the amplitude of the beam that is wanted, and of the lens's aperture or of the gap around it."""
+    """Return the share of the amplitude that beam, and the lens's aperture or the gap around it, let through."""
     passed: Floats | float = 1.0
     if lens.element.aperture_um is not None:
         round_lens = samples.disc(0.0, 0.0, lens.element.aperture_um / 2)

@@ -48,9 +48,9 @@ class Spots:
     places_um
         Centre of each spot, right and down of the axis, (spots, 2).
     light
-        Its share of the PSF, (spots,).
+        Share of the light of the PSF in each spot, (spots,).
     focus_dpt
-        M, J0 and J45 at the eye that would bring its lens into focus on the sensor, (spots, 3).
+        M, J0 and J45 of the eye for which its lens is in focus on the sensor, (spots, 3).
     centroids_um
         Centroid of the cell of its lens on the iris, (spots, 2).
     cells_um
@@ -199,13 +199,13 @@ class _Patch:
         return np.asarray(np.hypot(along[None] - self.off_um[0], along[:, None] - self.off_um[1]) < NEAR_UM)
 
     def of(self, pixels: Image) -> Floats:
-        """Return the square of an image; 0 beyond it."""
+        """Return the image within this patch; 0 beyond the image."""
         square = np.zeros((self.size, self.size))
         square[self._inside] = pixels[self._rows, self._cols]
         return square
 
     def add(self, square: Floats | Mask, pixels: Floats) -> None:
-        """Add a square to an image, in place."""
+        """Add the pixels of this patch to an image, in place."""
         pixels[self._rows, self._cols] += square[self._inside]
 
     def image(self, spectrum: Spectrum) -> Floats:

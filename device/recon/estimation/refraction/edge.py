@@ -1,8 +1,8 @@
-"""Field edge in the likelihood of a refraction: diameter, centre and softness of the lit disc, estimated with the eye.
+"""Field edge in the likelihood of a refraction: diameter, centre and width of the lit disc, estimated with the eye.
 
 A cropped sensor shows only the inner part of the PSF of a point at the field edge, so that a displaced edge looks like
-another refraction: 0.1 deg of diameter cost 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. So the edge is not
-taken from the calibration. For each candidate eye T the likelihood of `estimator` is minimised over the edge e:
+another refraction: 0.1 deg of diameter cost 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. So the edge of the
+calibration is a prior only. For each candidate eye T the likelihood of `estimator` is minimised over the edge e:
 
     E(T) = min over d of  sum over f of  log S + |R_T - sum_k d_k R_T,k|^2 / S  +  |(e + d - e_expected) / PRIOR|^2
 
@@ -47,9 +47,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EdgeModel:
-    """Linear model of the edge around one candidate: spectra of the derivatives, (k, K), and their covariance model.
+    """Linear model of the edge around one candidate: spectra of the derivatives by k parameters, (k, K).
 
-    `weighted` is the conjugate of `moved` over the spectrum S; `matrix` half the information on the k parameters.
+    `weighted` is the conjugate of `moved` over the spectrum S; `matrix` half the information on the k parameters, that
+    of the prior included.
     """
 
     moved: Spectrum
@@ -128,7 +129,7 @@ class EdgeLikelihood:
         return self.frame
 
     def expect(self, edge: Edge) -> None:
-        """Begin again with this edge, and look for the frame's around it."""
+        """Begin again with this edge, and centre the prior on it."""
         self.prior = self.prior.around(edge)
         self.edge = edge
 

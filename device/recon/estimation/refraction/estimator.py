@@ -195,7 +195,7 @@ class RefractionEstimator:
 
     @cached_property
     def likelihood(self) -> RefractionLikelihood:
-        """Likelihood within the calibrated field edge, for tests of the head."""
+        """Likelihood within the calibrated field edge, for the check of a PSF against frames."""
         otf = self._edges.likelihood.interpolated_otf
         return RefractionLikelihood(self._calibration, self.geometry, self._shape, self._planner, self._index, otf)
 
@@ -391,7 +391,7 @@ class RefractionEstimator:
         """Return M after at most `most` rounds of smooth part, search over M, and edge, from an M on.
 
         The second value is True if the edge was found. A soft edge has no structure that looks like another refraction:
-        it is found once M does not follow it.
+        it counts as found once M changes by less than SETTLED_DPT in a round.
         """
         edges, step_dpt = self._edges, self.step_dpt / 2
         is_soft = edges.prior.softness > 1
