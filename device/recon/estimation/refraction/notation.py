@@ -95,7 +95,7 @@ def doubt_of(refraction_dpt: Mapping[str, float | str | None] | None) -> tuple[s
     sphere, sd = (None, None) if refraction_dpt is None else (refraction_dpt.get(key) for key in ("sphere", "sd"))
     if not isinstance(sphere, float) or not isinstance(sd, float) or (abs(sphere) <= FAR_DPT and sd <= MAX_SD_DPT):
         return ()
-    return (f"The refraction of {sphere:+.1f} dpt (sd {sd:.1f}) is uncertain.",)
+    return (f"The refraction of {sphere:+.1f} dpt (sd {sd:.2f}) is uncertain.",)
 
 
 def scatter_of(found: Refraction | NoRefraction | None) -> dict[str, float] | None:
