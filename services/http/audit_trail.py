@@ -22,8 +22,8 @@ VIEW, LIST_VISITS, LIST_PICTURES, LIST_USERS, READ_EVENT_LOG, HOLD_CAMERA = (
     "read-event-log",
     "hold-camera",
 )
-# A page asks these again and again: one entry for each user and record in this time. And a stranger, who asks without
-# end, gets one for each address, action and status, since each entry is written with fsync.
+# A page asks these again and again: one entry for each user and record in this time. What is refused, and all that an
+# address without a login asks, has one for each action and status, since each entry is written with fsync.
 REPEATED = {VIEW, LIST_VISITS, LIST_PICTURES, LIST_USERS, READ_EVENT_LOG, HOLD_CAMERA}
 AGAIN_S = 300.0
 REFUSED = "refused"  # before access: a foreign host name or origin, or a body that is too large
