@@ -363,6 +363,7 @@ def test_inconsistent_requests_are_refused(old_rig: Any) -> None:
     ask(404, "store.unknown", "/api/visits/unknown/finish")
     ask(404, "store.unknown", "/api/visits/%00%ff/finish")
     refused(old_rig.request("GET", "/api/visits?day=today"), 422, "input")
+    refused(old_rig.request("GET", "/api/visits?day=0"), 422, "input")  # no seconds since 1970
     refused(old_rig.request("GET", "/api/visits?q=%25"), 422, "input")
     refused(old_rig.request("GET", "/api/visits?limit=0"), 422, "input")
 

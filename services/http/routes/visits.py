@@ -31,7 +31,7 @@ from services.records.visit import Visit
 from services.records.visit_document import VisitDocument, visit_document
 from services.records.visit_repository import VisitRepository
 
-ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+ISO_DATE = re.compile("[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 
 def iso_date(text: str | None) -> str | None:
