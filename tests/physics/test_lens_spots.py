@@ -14,6 +14,7 @@ from device.config.scene import ElementFlaws
 from device.optics import lenslets
 from device.optics.diffuser import Refraction
 from device.recon.estimation.psf_warp import transform, warped
+from device.recon.estimation.refraction.spot_stretch import SpotStretch
 from device.recon.model.spots import GAP_LIGHT, Spots, find_spots, without_noise
 from device.recon.stage import default_schedule
 from device.sim.plan import decide
@@ -94,6 +95,54 @@ def test_excess_of_the_field_is_that_of_its_outermost_ring_and_zero_with_a_flat_
     excess_dpt = geometry().lens_excess_dpt(33.4)[-1]
     assert excess_dpt == pytest.approx([(12.2 + 26.8) / 2 * 6000 / 6124 * 5 / 6, 0, 0], abs=0.1)
     assert not optics(flat_field=True).geometry(PITCH_UM).lens_excess_dpt(33.4).any()
+
+
+def test_cells_end_at_the_iris_also_where_lenses_stand_beyond_it() -> None:
+    """The outer lenses of the hexagonal array stand at 1732 um, the iris ends at 1600: their cells lie at 1425 um."""
+    spots = hexagonal()
+    outer = np.hypot(*spots.places_um.T) > 1600
+    assert outer.sum() == 6
+    assert np.hypot(*spots.centroids_um[outer].T) == pytest.approx(1425, abs=20)
+
+
+def test_stretch_of_centred_cells_is_that_of_the_eye() -> None:
+    """Within .01 dpt, of which .007 is the field's mean behind cells that are centred to 2 um."""
+    stretch = SpotStretch(found(seen()), 33.4)
+    for eye in ((-8.0, 0.0, 0.0), (0.0, 0.0, 0.0), (6.0, 0.8, -0.5)):
+        off_dpt = (stretch(*eye) - transform(geometry(), *eye)) / geometry().scale_per_dpt
+        assert np.abs(off_dpt).max() < 0.01, eye
+    assert stretch.sd_dpt == pytest.approx(0.015, abs=0.002)
+
+
+def test_stretch_of_cut_cells_is_that_of_the_spots_of_wave_optics() -> None:
+    """Places of the simulated spots, on the axis. The stretch counts spots out of focus less, which is .12 dpt."""
+    m_dpt = -6.0
+    spots, seen_spots = hexagonal(), hexagonal(Refraction(m_dpt))
+    weights = spots.light[:, None] ** 2 * spots.places_um**2
+    moved = (seen_spots.places_um - spots.places_um) / np.where(spots.places_um == 0, 1, spots.places_um)
+    seen_dpt = -np.sum(weights * moved, axis=0) / weights.sum(axis=0) / geometry().scale_per_dpt
+    stretched_dpt = (1 - np.diag(SpotStretch(spots, 0.0)(m_dpt))) / geometry().scale_per_dpt
+    assert stretched_dpt == pytest.approx(seen_dpt, abs=0.12)
+    assert abs(stretched_dpt.mean() - seen_dpt.mean()) < abs(m_dpt - seen_dpt.mean()) - 0.03, (
+        "the eye's own stretch is another one"
+    )
+
+
+def hexagonal(eye: Refraction = NO_EYE) -> Spots:
+    """Return the spots of the stock array of 1 mm on the axis, the same ones in the same order for every eye."""
+    head = load_head(resources.HEADS / "imx296_hexagonal.toml").optics
+    assert head is not None
+    spots = find_spots(Psf(lenslets.spots(head, PITCH_UM, 1, eye)), head.geometry(PITCH_UM))
+    assert spots is not None
+    order = np.lexsort(np.rint(spots.places_um / 200).T)
+    return replace(
+        spots,
+        places_um=spots.places_um[order],
+        light=spots.light[order],
+        focus_dpt=spots.focus_dpt[order],
+        centroids_um=spots.centroids_um[order],
+        cells_um=tuple(spots.cells_um[number] for number in order),
+    )
 
 
 def test_noise_between_the_spots_is_left_out_and_the_spots_stay() -> None:

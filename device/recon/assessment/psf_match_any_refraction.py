@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon.assessment.field_edge import FieldEdgeFit
-from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction.estimator import MIN_FREQUENCIES, RefractionEstimator, Search
 from device.recon.estimation.refraction.likelihood import BandLikelihood, noise_power
 from device.recon.model.kernels import Pixels
@@ -111,7 +110,7 @@ class PsfMatchTest:
         smooth = likelihood.fit_smooth(frame, likelihood.model.stored)
         if not smooth.level_dn > 0:
             return None
-        relaxed = likelihood.residual(frame, smooth, transform(likelihood.geometry, 0.0))
+        relaxed = likelihood.residual(frame, smooth, likelihood.stretch(0.0))
         noise = noise_power(likelihood.noise(frame, relaxed), frame)
 
         def found(m_dpt: float) -> BandLikelihood:
@@ -120,7 +119,7 @@ class PsfMatchTest:
 
         search = Search(lambda m_dpt: found(m_dpt).nats)
         m_dpt = search.descend(search.grid_search(refractor.step_dpt), refractor.step_dpt / 4)
-        stray_dn = likelihood.residual(frame, smooth, transform(likelihood.geometry, m_dpt)).stray_dn
+        stray_dn = likelihood.residual(frame, smooth, likelihood.stretch(m_dpt)).stray_dn
         score, sd = self._score(_filled(frame.linear) - np.float32(stray_dn), found(m_dpt).power, noise)
         if self._rim is None:
             return PsfMatchResult(score, sd, m_dpt, None, None)

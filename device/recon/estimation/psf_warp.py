@@ -7,7 +7,7 @@ wave propagation the correlation is 0.9995 at 5 dpt. M > 0 means that the beam l
 correction at the pupil is -M.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,13 @@ class Wavefront(NamedTuple):
     m_dpt: float
     j0_dpt: float = 0.0
     j45_dpt: float = 0.0
+
+
+class Stretch(Protocol):
+    """Stretch of the PSF as a function of M, J0 and J45 of an eye in dpt."""
+
+    def __call__(self, m_dpt: float, j0_dpt: float = 0.0, j45_dpt: float = 0.0) -> Transform:
+        """Return the matrix on (x, y) = (cols, rows)."""
 
 
 def transform(geometry: Geometry, m_dpt: float, j0_dpt: float = 0.0, j45_dpt: float = 0.0) -> Transform:

@@ -104,14 +104,15 @@ class Spots:
         pitch_um, shape = self.geometry.pitch_um, self.psf.shape
         calibrated, pixels = np.zeros(shape), np.zeros(shape)
         near = np.zeros(shape)
-        moved_um = self.centroids_um @ _matrix(np.array(eye)) * self.geometry.scale_per_dpt
-        eyes = np.array(eye) + self.geometry.lens_excess_dpt(field_deg)
+        moved_um = self.centroids_um @ power_matrix(np.array(eye)) * self.geometry.scale_per_dpt
+        excess_dpt = self.geometry.lens_excess_dpt(field_deg)
         for number, place_um in enumerate(self.places_um):
             before, after = _Patch(shape, pitch_um, place_um), _Patch(shape, pitch_um, place_um - moved_um[number])
             known = self._calibrated[number]
             rest = np.where(before.near, before.of(self.psf.pixels) - known, 0)
             rest = ndimage.shift(rest, (after.off_um - before.off_um)[::-1] / pitch_um, order=3)
-            after.add(self._model(number, eyes, after) + self._kept(number, eyes) * rest, pixels)
+            model = self._model(number, self.mean_spectrum(number, eye, field_deg, after.right, after.down), after)
+            after.add(model + self._kept(number, np.array(eye) + excess_dpt) * rest, pixels)
             before.add(known, calibrated)
             before.add(before.near, near)
         if self.beside > GAP_LIGHT:
@@ -121,7 +122,7 @@ class Spots:
     def _kept(self, number: int, eyes: Floats) -> float:
         """Return the share of a spot's rest that these eyes, (eyes, 3), have in common with that of the calibration."""
         per_dpt = 1e-6 * self.geometry.angular_magnification**2 * _corner_um(self.cells_um[number]) ** 2
-        waves = [np.linalg.norm(_matrix(eye), 2) * per_dpt / (2 * WAVELENGTH_UM) for eye in eyes]
+        waves = [np.linalg.norm(power_matrix(eye), 2) * per_dpt / (2 * WAVELENGTH_UM) for eye in eyes]
         return float(np.exp(-np.square(4 * np.array(waves))).mean())
 
     @cached_property
@@ -129,13 +130,45 @@ class Spots:
         """Model of each spot for the eye of the calibration."""
         shape, pitch_um = self.psf.shape, self.geometry.pitch_um
         patches = [_Patch(shape, pitch_um, place_um) for place_um in self.places_um]
-        return [self._model(number, np.zeros((1, 3)), patch) for number, patch in enumerate(patches)]
+        return [
+            self._model(number, self.spectrum(number, self.focus_dpt[number], patch.right, patch.down), patch)
+            for number, patch in enumerate(patches)
+        ]
 
-    def _model(self, number: int, eyes: Floats, patch: "_Patch") -> Floats:
-        """Return the pixels of a spot, mean of these eyes, (eyes, 3)."""
-        foci = self.focus_dpt[number] - eyes
-        spectra = [self.spectrum(number, focus_dpt, patch.right, patch.down) for focus_dpt in foci]
-        return patch.image(self.light[number] * np.mean(spectra, axis=0))
+    def _model(self, number: int, spectrum: Spectrum, patch: "_Patch") -> Floats:
+        return patch.image(self.light[number] * spectrum)
+
+    def mean_spectrum(self, number: int, eye: Eye, field_deg: float, right: Floats, down: Floats) -> Spectrum:
+        """Return the transfer of a spot behind an eye around its centre on the axis, mean over a field of view.
+
+        A lens with another focus displaces its spot by the distance of its cell's centroid from its own centre.
+
+        Parameters
+        ----------
+        number
+            Index of the spot.
+        eye
+            M, J0 and J45 in dpt.
+        field_deg
+            Diameter of the field; 0: the axis.
+        right
+            Frequencies along the columns, per um.
+        down
+            Frequencies along the rows, per um, of the same shape.
+
+        Returns
+        -------
+        Spectrum
+            Complex, of that shape.
+        """
+        scale, drawn_dpt = self.geometry.scale_per_dpt, self.geometry.lens_focus_dpt or 0.0
+        off_um = (self.centroids_um[number] - self.places_um[number]) / (1 - scale * drawn_dpt)
+        spectra = []
+        for excess_dpt in self.geometry.lens_excess_dpt(field_deg):
+            moved_um = -scale * power_matrix(excess_dpt) @ off_um
+            turn = np.exp(-2j * np.pi * (right * moved_um[0] + down * moved_um[1]))
+            spectra.append(turn * self.spectrum(number, self.focus_dpt[number] - eye - excess_dpt, right, down))
+        return np.asarray(np.mean(spectra, axis=0))
 
     def spectrum(self, number: int, focus_dpt: Floats, right: Floats, down: Floats) -> Spectrum:
         """Return the transfer of a spot around its centre.
@@ -163,7 +196,7 @@ class Spots:
         radius = np.hypot(right, down)
         apart = np.clip(WAVELENGTH_UM * self.geometry.diffuser_to_sensor_um * radius / wide_um, 0, 1)
         diffraction = 2 / np.pi * (np.arccos(apart) - apart * np.sqrt(1 - apart**2))
-        spread = _matrix(focus_dpt) * self.geometry.scale_per_dpt
+        spread = power_matrix(focus_dpt) * self.geometry.scale_per_dpt
         across, along = np.moveaxis(np.stack([right, down], axis=-1) * (1 - apart)[..., None] @ spread, -1, 0)[
             ..., None
         ]
@@ -324,13 +357,13 @@ def _seen_spots(psf: Psf, pitch_um: float) -> tuple[Floats, Floats]:
 def _cells(places_um: Floats, light: Floats) -> tuple[Floats, tuple[Floats, ...], float]:
     """Return the centroid of the cell of each spot's lens, its chords around it, and the distance of chords, um.
 
-    Each place of the iris belongs to the nearest spot. Of 17 radii of the iris that one is taken for which the areas of
-    the cells fit the light of the spots best.
+    Each place of the iris belongs to the nearest spot. Of 29 radii of the iris that one is taken for which the areas of
+    the cells fit the light of the spots best; lenses at the rim may have their centres beyond it.
     """
     reach_um = float(np.hypot(*places_um.T).max())
     nearest_um = np.sort(np.hypot(*(places_um[:, None] - places_um[None]).transpose(2, 0, 1)), axis=1)[:, 1]
     fits = []
-    for radius_um in reach_um + float(np.median(nearest_um)) * np.linspace(0.1, 0.9, 17):
+    for radius_um in reach_um + float(np.median(nearest_um)) * np.linspace(-0.5, 0.9, 29):
         areas = np.array([cell[:, 2].sum() for cell in _chords(places_um, radius_um)[0]])
         fits.append((float(np.square(areas / areas.sum() - light / light.sum()).sum()), float(radius_um)))
     cells, chord_um = _chords(places_um, min(fits)[1])
@@ -361,7 +394,7 @@ def _corner_um(cell_um: Floats) -> float:
     return float(np.hypot(np.abs(cell_um[:, 0]) + cell_um[:, 2] / 2, cell_um[:, 1]).max())
 
 
-def _matrix(focus_dpt: Floats) -> Floats:
+def power_matrix(focus_dpt: Floats) -> Floats:
     """Return M, J0 and J45 as the power matrix."""
     m_dpt, j0_dpt, j45_dpt = focus_dpt
     return np.array([[m_dpt + j0_dpt, j45_dpt], [j45_dpt, m_dpt - j0_dpt]])

@@ -26,8 +26,6 @@ from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.pupil import dark_rim
 from device.recon.model.fft_plans import Planner
 
-MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
-SPOT_MODEL_SD_DPT = 0.015  # the same behind lenslets
 VARIANCE_PER_MISFIT = 1.7  # of the misfit: the detail takes up a quarter of the residual; the rest is correlated
 BIAS_SHARE = 0.7  # of b: sd by its own error, as b is taken at the fit and not at the true retina
 MAX_STEPS = 12  # 2 to 4 are usual
@@ -77,10 +75,13 @@ class Refined:
 
 
 class CropRefinement:
-    """Refinement of the eyes that an `EdgeLikelihood` has found, on the same grid, for a PSF with this radius."""
+    """Refinement of the eyes that an `EdgeLikelihood` has found, on the same grid, for a PSF with this radius.
 
-    def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
-        self._edges, self._psf_radius_px = edges, psf_radius_px
+    `model_sd_dpt`: sd of each component by the model.
+    """
+
+    def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float, model_sd_dpt: float) -> None:
+        self._edges, self._psf_radius_px, self._model_sd_dpt = edges, psf_radius_px, model_sd_dpt
         self._model = CropModel(edges, planner, psf_radius_px)
 
     def steps(self, eye_dpt: Floats, edge: FieldEdge, frames: Sequence[BurstFrame]) -> Floats:
@@ -93,9 +94,7 @@ class CropRefinement:
         model = self._model
         detail = None
         model.start(eye_dpt)
-        has_spots = self._edges.likelihood.geometry.has_spots
-        model_sd_dpt = SPOT_MODEL_SD_DPT if has_spots else MODEL_SD_DPT
-        has_bias = model.seen_share < 1 and not has_spots
+        has_bias = model.seen_share < 1 and not self._edges.likelihood.geometry.has_spots
         without_noise = np.zeros(3)
         by_noise = np.zeros(3)
         for done in range(MAX_STEPS):
@@ -115,13 +114,14 @@ class CropRefinement:
             if done >= FULL_STEPS:
                 step = step / 2
             eye_dpt = eye_dpt + np.clip(step, -LARGEST_STEP_DPT, LARGEST_STEP_DPT)
-            sds_dpt = np.sqrt(np.diag(covariance) + model_sd_dpt**2)
+            sds_dpt = np.sqrt(np.diag(covariance) + self._model_sd_dpt**2)
             has_settled = bool((np.abs(step) < SETTLED_SDS * sds_dpt).all())
             if has_settled:
                 break
         self._edges.fit_smooth(eye_dpt)
         rim_sd = dark_rim(self._edges, eye_dpt, fit, self._psf_radius_px)
-        return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled, rim_sd, model_sd_dpt)
+        misfit = model.misfit(light, fit)
+        return Refined(eye_dpt, covariance, bias_dpt, misfit, has_settled, rim_sd, self._model_sd_dpt)
 
     def _score_of_noise(self, fit: Fit) -> Floats:
         """Return the mean score (3,) that the sensor's noise adds to that of the expected frame of a fit.

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon.estimation.noise import Noise
-from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.field import Edge
 from device.recon.model import fused_kernels
@@ -141,7 +140,7 @@ class CropModel:
     def focus(self, eye_dpt: Floats) -> None:
         """Set OTF, its derivatives and the preconditioner to an eye."""
         likelihood, grid = self._edges.likelihood, self._grid
-        stretch = transform(likelihood.geometry, *eye_dpt)
+        stretch = likelihood.stretch(*eye_dpt)
         likelihood.interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
         self._focus_on(self._otf, [_slope(self._edges, eye_dpt, step) for step in np.eye(3) * DERIVATIVE_STEP_DPT])
 
@@ -253,9 +252,7 @@ def _slope(edges: EdgeLikelihood, eye_dpt: Floats, step_dpt: Floats) -> Spectrum
     """Return the derivative of the OTF with respect to the eye along a small step, per dpt."""
     likelihood, grid = edges.likelihood, edges.grid
     above, below = (
-        likelihood.interpolated_otf.on_grid(
-            grid.shape, grid.n, transform(likelihood.geometry, *(eye_dpt + sign * step_dpt))
-        )
+        likelihood.interpolated_otf.on_grid(grid.shape, grid.n, likelihood.stretch(*(eye_dpt + sign * step_dpt)))
         for sign in (1, -1)
     )
     return np.asarray((above - below) / np.float32(2 * DERIVATIVE_STEP_DPT), np.complex64)

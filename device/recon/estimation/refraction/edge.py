@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from device.recon.estimation.background import SensorPolynomial, without
 from device.recon.estimation.noise import Noise
-from device.recon.estimation.psf_warp import InterpolatedOtf, transform
+from device.recon.estimation.psf_warp import InterpolatedOtf, Stretch
 from device.recon.estimation.refraction.field import Edge, EdgePrior, FieldEdge, LitField
 from device.recon.estimation.refraction.likelihood import (
     Band,
@@ -86,6 +86,7 @@ class EdgeLikelihood:
         self,
         calibration: Calibration,
         geometry: Geometry,
+        stretch: Stretch,
         shape: Pair,
         planner: Planner,
         index: int,
@@ -97,7 +98,7 @@ class EdgeLikelihood:
         wide = replace(calibration, field_deg=2 * EdgePrior(diameter_deg, width_deg, 1.0).largest_samples)
         otf = InterpolatedOtf(calibration.psfs[index])
         sample_um = SPOT_SAMPLE_UM if geometry.has_spots else SAMPLE_UM
-        self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, otf, sample_um)
+        self.likelihood = RefractionLikelihood(wide, geometry, stretch, shape, planner, index, otf, sample_um)
         self.grid = self.likelihood.grid
         self.band: Band = self.likelihood.bands.whole
         self.prior = EdgePrior(diameter_deg, width_deg, geometry.px_per_deg / self.grid.n)
@@ -135,7 +136,7 @@ class EdgeLikelihood:
 
     def set_noise(self, eye_dpt: Floats) -> None:
         """Set the noise from the sensor's gain, or from the residual of this candidate."""
-        stretch = transform(self.likelihood.geometry, *eye_dpt)
+        stretch = self.likelihood.stretch(*eye_dpt)
         residual = self.likelihood.residual(self._sampled, self._smooth, stretch)
         self.noise = self.likelihood.noise(self._sampled, residual)
         self._noise_dn2 = noise_power(self.noise, self._sampled)
@@ -143,7 +144,7 @@ class EdgeLikelihood:
 
     def fit_smooth(self, eye_dpt: Floats) -> float:
         """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
-        stretch = transform(self.likelihood.geometry, *eye_dpt)
+        stretch = self.likelihood.stretch(*eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(self.grid.shape, self.grid.n, stretch)
         smooth = self.field.fit(self._whole, otf, self.edge, self._uneven)
         self._sampled = replace(self._sampled, linear=without(self._whole, smooth.background))
@@ -158,7 +159,7 @@ class EdgeLikelihood:
         1), in the units of the levels of the rings.
         """
         fft, grid, known = self.likelihood.model.fft, self.grid, self._sampled.known
-        stretch = transform(self.likelihood.geometry, *eye_dpt)
+        stretch = self.likelihood.stretch(*eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(grid.shape, grid.n, stretch)
         np.multiply(self._smooth.spectrum, otf, out=fft.spectrum)
         rest = self.frame.y - fft.inverse()[grid.slices] / np.float32(grid.size)
@@ -192,7 +193,7 @@ class EdgeLikelihood:
 
     def _residual(self, eye_dpt: Floats) -> tuple[Spectrum, Spectrum, Residual]:
         """Return residual and OTF at the band's frequencies, (K,), and the whole residual."""
-        stretch = transform(self.likelihood.geometry, *eye_dpt)
+        stretch = self.likelihood.stretch(*eye_dpt)
         residual = self.likelihood.residual(self._sampled, self._smooth, stretch)
         return *self.likelihood.at_band(residual, stretch), residual
 

@@ -6,23 +6,23 @@ mean sphere M, cylinder J0, J45 and the field edge e (`likelihood`, `edge`, NUME
 
     E(M, J0, J45, e) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_T|^2 + s2
 
-The search stretches the PSF of lenslets as well; only the picture (`otf`) uses the model of their spots. |H_T|^2
-includes `likelihood.SMEAR` times its ring mean. R is the tapered spectrum of the frame minus the smooth part of the
-object behind the *candidate's* PSF. If that part is blurred by a fixed PSF, the estimate is biased by one third towards
-that PSF. The smooth part itself is fitted with the stored PSF for the coarse search over M, and with the PSF and edge
-found for each fine search.
+The search stretches the PSF of lenslets as well (`spot_stretch`); only the picture (`otf`) uses the model of their
+spots. |H_T|^2 includes `likelihood.SMEAR` times its ring mean. R is the tapered spectrum of the frame minus the smooth
+part of the object behind the *candidate's* PSF. If that part is blurred by a fixed PSF, the estimate is biased by one
+third towards that PSF. The smooth part itself is fitted with the stored PSF for the coarse search over M, and with the
+PSF and edge found for each fine search.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.psf_warp import Wavefront, picture_otf, transform
+from device.recon.estimation.psf_warp import Stretch, Wavefront, picture_otf, transform
 from device.recon.estimation.refraction.burst import LARGEST_STEP_DPT, MAX_SCATTER_DPT, MIN_FRAMES, FrameScatter
 from device.recon.estimation.refraction.crop import CropRefinement
 from device.recon.estimation.refraction.crop_model import seen_share
@@ -32,6 +32,7 @@ from device.recon.estimation.refraction.field import FieldEdge
 from device.recon.estimation.refraction.likelihood import RefractionLikelihood
 from device.recon.estimation.refraction.lit_disc import seen_disc
 from device.recon.estimation.refraction.pupil import SOFT_UM, Pupil, PupilFinder
+from device.recon.estimation.refraction.spot_stretch import spot_stretch
 from device.recon.estimation.refraction.uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
@@ -55,6 +56,7 @@ MOVING_SAMPLES = 0.6  # last change of an edge that was not found
 CROPPED_SD_DPT = 0.6  # a border through an optic disc: rms error of M and J0 of 14 frames, before the refinement
 CURVATURE_STEP_DPT = 0.25
 MAX_SD_DPT = 1.5
+MODEL_SD_DPT = 0.02  # of each component by the model of a refinement, behind a diffuser
 MAX_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MAX_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
@@ -177,14 +179,20 @@ class RefractionEstimator:
             raise SettingError("a refraction needs the head's geometry and field", "Give --head HEAD.toml.")
         self.geometry = geometry
         self._calibration, self._shape, self._planner, self._index = calibration, shape, planner, index
-        self._edges = EdgeLikelihood(calibration, geometry, shape, planner, index, edge_is_known)
+        spots = find_spots(calibration.psfs[index], geometry)
+        self._stretch: Stretch = partial(transform, geometry)
+        model_sd_dpt = MODEL_SD_DPT
+        if spots is not None:
+            self._stretch = by_spots = spot_stretch(spots, calibration.field_deg or 0.0)
+            model_sd_dpt = by_spots.sd_dpt
+        self._edges = EdgeLikelihood(calibration, geometry, self._stretch, shape, planner, index, edge_is_known)
         taper = self._edges.likelihood.taper
         bands = self._edges.likelihood.bands
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
         self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
         self._reach_px = reach_px
-        self._refinement = CropRefinement(self._edges, planner, reach_px)
+        self._refinement = CropRefinement(self._edges, planner, reach_px, model_sd_dpt)
         lever = bands.high / self._edges.grid.n * 2 * reach_px * geometry.scale_per_dpt
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
 
@@ -197,7 +205,8 @@ class RefractionEstimator:
     def likelihood(self) -> RefractionLikelihood:
         """Likelihood within the calibrated field edge, for the check of a PSF against frames."""
         otf = self._edges.likelihood.interpolated_otf
-        return RefractionLikelihood(self._calibration, self.geometry, self._shape, self._planner, self._index, otf)
+        calibration, geometry, stretch = self._calibration, self.geometry, self._stretch
+        return RefractionLikelihood(calibration, geometry, stretch, self._shape, self._planner, self._index, otf)
 
     def find(
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None
@@ -451,7 +460,7 @@ class RefractionEstimator:
         spots = find_spots(self._calibration.psfs[self._index], self.geometry)
         if spots is not None:
             return otf(spots.of_eye(eye, self._calibration.field_deg or 0.0), model.grid)
-        return picture_otf(self._edges.likelihood.interpolated_otf, model, transform(self.geometry, *eye))
+        return picture_otf(self._edges.likelihood.interpolated_otf, model, self._stretch(*eye))
 
 
 class Search:

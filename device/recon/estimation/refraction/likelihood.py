@@ -15,7 +15,7 @@ from device.recon.estimation.background import Background
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import flat_fit
 from device.recon.estimation.power_law_prior import band
-from device.recon.estimation.psf_warp import InterpolatedOtf, Transform, transform
+from device.recon.estimation.psf_warp import InterpolatedOtf, Stretch, Transform
 from device.recon.estimation.shading import Shading
 from device.recon.model import fused_kernels, kernels
 from device.recon.model.fft_plans import Planner, RealFft, Spectrum
@@ -171,13 +171,14 @@ class RefractionLikelihood:
         self,
         calibration: Calibration,
         geometry: Geometry,
+        stretch: Stretch,
         shape: Pair,
         planner: Planner,
         index: int,
         interpolated_otf: InterpolatedOtf,
         sample_um: float = SAMPLE_UM,
     ) -> None:
-        self.geometry = geometry
+        self.geometry, self.stretch = geometry, stretch
         self.sensor = calibration.sensor
         self.interpolated_otf = interpolated_otf
         n = max(1, min(round(sample_um / geometry.pitch_um), min(shape) // 16))
@@ -196,7 +197,7 @@ class RefractionLikelihood:
 
     def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
         """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
-        return self.interpolated_otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
+        return self.interpolated_otf.on_grid(grid.shape, grid.n, self.stretch(m_dpt))
 
     @cached_property
     def _shading(self) -> Shading:
@@ -280,7 +281,7 @@ class RefractionLikelihood:
 
     def of_sphere(self, frame: SampledFrame, smooth: SmoothPart, noise_dn2: float, m_dpt: float) -> BandLikelihood:
         """Return the likelihood of the candidate M; `noise_dn2` is the noise of a frequency."""
-        stretch = transform(self.geometry, m_dpt)
+        stretch = self.stretch(m_dpt)
         rest, otf = self.at_band(self.residual(frame, smooth, stretch), stretch)
         return band_likelihood(rest, otf, self.bands.whole, noise_dn2)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import fft as scipy_fft
 from scipy.special import ndtr
 
-from device.recon.estimation.psf_warp import Transform, transform
+from device.recon.estimation.psf_warp import Transform
 from device.recon.estimation.refraction.crop_model import CropModel, Fit
 from device.recon.estimation.refraction.edge import EdgeLikelihood
 from device.recon.estimation.refraction.likelihood import SampledFrame, band_likelihood, noise_power
@@ -98,7 +98,7 @@ class PupilModel(CropModel):
 def otf_behind(edges: EdgeLikelihood, eye_dpt: Floats, pupil: Pupil | None) -> Spectrum:
     """Return the OTF of an eye (M, J0, J45) behind a pupil, on the grid of `edges`; None: the whole PSF."""
     likelihood, grid = edges.likelihood, edges.grid
-    stretch = transform(likelihood.geometry, *eye_dpt)
+    stretch = likelihood.stretch(*eye_dpt)
     otf = likelihood.interpolated_otf.on_grid(grid.shape, grid.n, stretch)
     if pupil is None:
         return otf
@@ -190,7 +190,7 @@ class _SpectrumLikelihood:
         self._edges, self._frame, self._eye_dpt = edges, frame, eye_dpt
         likelihood = edges.likelihood
         smooth = likelihood.fit_smooth(frame, otf_behind(edges, eye_dpt, None))
-        residual = likelihood.residual(frame, smooth, transform(likelihood.geometry, *eye_dpt))
+        residual = likelihood.residual(frame, smooth, likelihood.stretch(*eye_dpt))
         self._noise_dn2 = noise_power(likelihood.noise(frame, residual), frame)
         self._known: dict[Pupil | None, float] = {}
 
@@ -222,7 +222,7 @@ def dark_rim(edges: EdgeLikelihood, eye_dpt: Floats, fit: Fit, psf_radius_px: fl
     """
     grid, likelihood = edges.grid, edges.likelihood
     pitch_um = likelihood.geometry.pitch_um
-    right_um, down_um = _places_um(grid, pitch_um, transform(likelihood.geometry, *eye_dpt))
+    right_um, down_um = _places_um(grid, pitch_um, likelihood.stretch(*eye_dpt))
     radius = np.hypot(right_um, down_um) / (psf_radius_px * pitch_um)
     weighted = np.zeros(grid.shape, np.float32)
     weighted[grid.slices] = fit.weighted
