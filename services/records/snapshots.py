@@ -142,7 +142,7 @@ def carry_dose(replaced: Path, restored: Path) -> None:
 
     A replaced database that cannot be read has its doses in the copy; a restored one without tables is rebuilt from the
     files, and then gets the doses of the copy. The observed time becomes that of the copy, or of the restored tables if
-    theirs is later, as those of another device are. The copy, which has another one, is removed.
+    theirs is later, as those of another device are. The copies, which have another one, are removed.
     """
     copy = DoseLedgerLog(replaced.parent).newest()
     state = copy or DoseLedgerState()
@@ -154,6 +154,7 @@ def carry_dose(replaced: Path, restored: Path) -> None:
         if "observed_time" not in {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}:
             return
         _raise_to(state, _ledger_in(tables))
+        _raise_to(state, DoseLedgerLog(restored.parent).newest() or DoseLedgerState(), with_time=False)
         tables.execute("BEGIN IMMEDIATE")
         for (eye, interval), dose_j_per_cm2 in state.doses.items():
             tables.execute(
@@ -165,7 +166,8 @@ def carry_dose(replaced: Path, restored: Path) -> None:
             (state.boot, state.now_s, state.observed_s),
         )
         tables.execute("COMMIT")
-    (replaced.parent / LOG).unlink(missing_ok=True)
+    for folder in (replaced.parent, restored.parent):
+        (folder / LOG).unlink(missing_ok=True)
 
 
 def _raise_to(state: DoseLedgerState, other: DoseLedgerState, with_time: bool = True) -> None:
