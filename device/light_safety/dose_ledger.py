@@ -58,11 +58,14 @@ class DoseLedgerState:
 
     def advance(self, boot: str, now_s: float, window_s: float) -> None:
         """Add the time since the last call (nothing after a reboot), and delete the intervals that no longer count."""
-        if boot == self.boot:
-            self.observed_s += max(0.0, now_s - self.now_s)
+        self.observed_s = self.observed_at_s(boot, now_s)
         self.boot, self.now_s = boot, now_s
         for eye, interval in [key for key in self.doses if self.left_s(key[1], window_s) <= 0]:
             del self.doses[eye, interval]
+
+    def observed_at_s(self, boot: str, now_s: float) -> float:
+        """Return the observed time, s, at the clock reading `now_s` of that boot."""
+        return self.observed_s + (max(0.0, now_s - self.now_s) if boot == self.boot else 0.0)
 
     def left_s(self, interval: int, window_s: float) -> float:
         """Return for how long an interval still counts, s, with one more for light that continued past its end."""

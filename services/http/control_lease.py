@@ -64,13 +64,13 @@ class ControlLease:
     def acquire_or_refuse(self, key: str | None) -> None:
         """Acquire or renew the lease for a changing request; ControlLeaseHeld if another screen holds it.
 
-        A request without a key (a script, or the push button) passes.
+        A request without a key (a script) passes.
         """
         if key is not None and not self.acquire(key).mine:
             raise ControlLeaseHeld("another screen holds the camera")
 
     def acquire_for_light(self, key: str | None) -> None:
-        """Acquire or renew the lease for a request of live pictures; ControlLeaseHeld if another screen holds it.
+        """Acquire or renew the lease for a request that lights the lamp; ControlLeaseHeld if another screen holds it.
 
         A request without a key passes only while no screen holds the lease.
         """

@@ -26,7 +26,7 @@ def acquire_control_lease(lease: ControlLease) -> Callable[..., None]:
 
 
 def acquire_lease_for_light(lease: ControlLease) -> Callable[..., Awaitable[None]]:
-    """Return the dependency that acquires or renews the control lease for a request of live pictures.
+    """Return the dependency that acquires or renews the control lease for a request that lights the lamp.
 
     ControlLeaseHeld if another screen holds the lease, for a request without a key if any screen does.
     """

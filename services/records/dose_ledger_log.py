@@ -52,15 +52,8 @@ class DoseLedgerLog:
             file.write(line)
 
 
-def raise_to(state: DoseLedgerState, other: DoseLedgerState) -> None:
-    """Raise each dose (J/cm2) and the observed time (s) in `state`, in place, to at least the value in `other`.
-
-    With the observed time, `boot` and `now_s` are those of `other`.
-    """
-    if other.observed_s > state.observed_s:
-        state.observed_s = other.observed_s
-        state.boot = other.boot
-        state.now_s = other.now_s
+def raise_doses(state: DoseLedgerState, other: DoseLedgerState) -> None:
+    """Raise each dose (J/cm2) in `state`, in place, to at least the value in `other`."""
     for key, dose_j_per_cm2 in other.doses.items():
         state.doses[key] = max(state.doses.get(key, 0.0), dose_j_per_cm2)
 

@@ -12,7 +12,7 @@ from device.errors import LightLimit, StoreError
 from device.light_safety.dose_ledger import INTERVAL_S, DoseLedgerState, Reserved
 from device.values import EYES, Eye
 from services.records import schema
-from services.records.dose_ledger_log import DoseLedgerLog, raise_to
+from services.records.dose_ledger_log import DoseLedgerLog, raise_doses
 from services.records.reserve_file import ReserveFile
 from services.records.schema import CaptureRow, DoseRow, ObservedTimeRow
 from services.records.storage_errors import storage_errors
@@ -27,22 +27,28 @@ REMEDY = "The light stays off while what it gives cannot be written down. Call t
 def add_given_dose(session: Session, eye: Eye, dose_j_per_cm2: float) -> None:
     """Add a dose (J/cm2) to `eye` for a capture that was recorded for the other eye; the limit is not checked.
 
-    The dose is added to the interval of the last observed time of the ledger, which is at or after the exposure.
+    The dose is added, in both copies, to the interval of the later of their observed times, at or after the exposure.
     """
-    seen = session.get(ObservedTimeRow, 1)
-    interval = int(seen.observed_s // INTERVAL_S) if seen is not None else 0
+    engine, seen = session.get_bind().engine, session.get(ObservedTimeRow, 1)
+    ledger_log = DoseLedgerLog(schema.folder_of(engine), schema.key_of(engine))
+    copy = ledger_log.newest()
+    interval = int(max((each.observed_s for each in (seen, copy) if each is not None), default=0.0) // INTERVAL_S)
     row = session.get(DoseRow, (eye, interval))
     before = row.dose_j_per_cm2 if row is not None else 0.0
     session.merge(DoseRow(eye=eye, interval=interval, dose_j_per_cm2=before + dose_j_per_cm2))
+    if copy is not None:
+        copy.add((eye,), interval, dose_j_per_cm2)
+        ledger_log.append(copy)
 
 
 class DoseLedgerStore:
     """Dose ledger in the database of the capture store; each change is durable when its call returns.
 
-    A dose counts for at least `window_s` (s) of observed time. Each reading raises every dose that is lower than in the
-    second copy (dose_ledger_log.py); opening adds the time since the last observation if it was in the same boot. If
-    both are gone while the store has captures, both eyes count as full. Writers are serialised, across processes too.
-    StoreError if the ledger cannot be read or written.
+    A dose counts for at least `window_s` (s) of observed time. Each reading takes the higher dose of the tables and the
+    second copy (dose_ledger_log.py) for each interval, and the lower observed time, under which more of it counts;
+    opening adds the time since the last observation if it was in the same boot. If both are gone while the store has
+    captures, both eyes count as full. Writers are serialised, across processes too. StoreError if the ledger cannot be
+    read or written.
     """
 
     def __init__(self, engine: Engine, clock: Clock, window_s: float, boot: str | None = None) -> None:
@@ -125,12 +131,12 @@ class DoseLedgerStore:
         for row in session.scalars(select(DoseRow)):
             eyes = (row.eye,) if row.eye in EYES else EYES  # unreadable eye: count for both
             state.add(eyes, row.interval, row.dose_j_per_cm2)
-        seen = session.get(ObservedTimeRow, 1)
-        if seen is not None:
-            state.observed_s = seen.observed_s
-            state.boot = seen.boot
-            state.now_s = seen.now_s
+        copies, now_s = list[DoseLedgerState](), self._clock.now_s()
+        if (seen := session.get(ObservedTimeRow, 1)) is not None:
+            copies.append(DoseLedgerState({}, seen.observed_s, seen.boot, seen.now_s))
         if (copy := self._log.newest()) is not None:
-            raise_to(state, copy)
-        state.advance(self._boot, self._clock.now_s(), self._window_s)
+            raise_doses(state, copy)
+            copies.append(copy)
+        state.observed_s = min((each.observed_at_s(self._boot, now_s) for each in copies), default=0.0)
+        state.advance(self._boot, now_s, self._window_s)
         return state

@@ -99,7 +99,7 @@ class RecordFiles:
 
 
 def new_key(folder: Path, key: bytes | None) -> bytes | None:
-    """Return the key if the files of a store were not all written with it; None without a key."""
+    """Return the key if no note says that the files of a store were written with it; None without a key."""
     path = folder / KEY_ID
     return None if key is None or (path.exists() and path.read_bytes() == _key_id(key)) else key
 

@@ -34,6 +34,7 @@ from device.errors import StoreError
 from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records import record_rows, row_validation, schema
+from services.records.dose_ledger_log import DoseLedgerLog
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.json_values import JsonObject
 from services.records.record_document import Kind, RecordDocument
@@ -89,8 +90,11 @@ class Recovery:
     def __init__(self, folder: Path, engine: Engine, rebuilt_because: str | None) -> None:
         self._folder = folder
         self._engine = engine
-        self._new_key = new_key(folder, schema.key_of(engine))
-        self._files = RecordFiles(folder, None if self._new_key else schema.key_of(engine))
+        key = schema.key_of(engine)
+        self._new_key = new_key(folder, key)
+        # The dose ledger is written after the first opening with a key: then its note was removed, and no file is new.
+        is_first = self._new_key is not None and DoseLedgerLog(folder, key).newest() is None
+        self._files = RecordFiles(folder, None if is_first else key)
         self.report = RecoveryReport(rebuilt_because=rebuilt_because)
         self._restored_visits: list[tuple[RecordDocument, bool]] = []
 

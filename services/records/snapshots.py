@@ -19,7 +19,7 @@ from device.light_safety.dose_ledger import DoseLedgerState
 from device.user_files import files_in
 from device.values import EYES
 from services.errors import RecordNotFound, StoreDamaged
-from services.records.dose_ledger_log import DoseLedgerLog, raise_to
+from services.records.dose_ledger_log import LOG, DoseLedgerLog, raise_doses
 from services.records.earlier_stores import refuse_earlier_store
 
 KEPT_VERSIONS = 3
@@ -141,17 +141,20 @@ def carry_dose(replaced: Path, restored: Path) -> None:
     """Raise the doses in the restored tables to those in the replaced ones and in the second copy of the ledger.
 
     A replaced database that cannot be read has its doses in the copy; a restored one without tables is rebuilt from the
-    files, and then gets the doses of the copy.
+    files, and then gets the doses of the copy. The observed time becomes that of the copy, or of the restored tables if
+    theirs is later, as those of another device are. The copies, which have another one, are removed.
     """
-    state = DoseLedgerLog(replaced.parent).newest() or DoseLedgerState()
+    copy = DoseLedgerLog(replaced.parent).newest()
+    state = copy or DoseLedgerState()
     if replaced.exists():
         with suppress(sqlite3.DatabaseError), _connected(replaced) as tables:
-            raise_to(state, _ledger_in(tables))
+            _raise_to(state, _ledger_in(tables), with_time=copy is None)
     with _connected(restored) as tables:
         tables.execute("PRAGMA journal_mode = DELETE")
         if "observed_time" not in {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}:
             return
-        raise_to(state, _ledger_in(tables))
+        _raise_to(state, _ledger_in(tables))
+        _raise_to(state, DoseLedgerLog(restored.parent).newest() or DoseLedgerState(), with_time=False)
         tables.execute("BEGIN IMMEDIATE")
         for (eye, interval), dose_j_per_cm2 in state.doses.items():
             tables.execute(
@@ -163,6 +166,14 @@ def carry_dose(replaced: Path, restored: Path) -> None:
             (state.boot, state.now_s, state.observed_s),
         )
         tables.execute("COMMIT")
+    for folder in (replaced.parent, restored.parent):
+        (folder / LOG).unlink(missing_ok=True)
+
+
+def _raise_to(state: DoseLedgerState, other: DoseLedgerState, with_time: bool = True) -> None:
+    raise_doses(state, other)
+    if with_time and other.observed_s > state.observed_s:
+        state.observed_s, state.boot, state.now_s = other.observed_s, other.boot, other.now_s
 
 
 def _ledger_in(tables: sqlite3.Connection) -> DoseLedgerState:

@@ -297,7 +297,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(LOOP, "in_visit=target.visit is not None", "in_visit=False", T_LIGHT),
     Mutant(LIVE, "in_visit=wanted.visit is not None", "in_visit=False", T_LIGHT),
     # Dose ledger
-    Mutant(LEDGER, "if boot == self.boot:", "if True:", T_BOOK),
+    Mutant(LEDGER, "if boot == self.boot else 0.0)", "if True else 0.0)", T_BOOK),
     Mutant(LEDGER, "self.left_s(key[1], window_s) <= 0]", "self.left_s(key[1], window_s) <= 2 * SLOT_S]", T_BOOK),
     Mutant(LEDGER, "return (interval + 2) * INTERVAL_S", "return (interval + 3) * INTERVAL_S", T_BOOK),
     Mutant(LEDGER, "self.doses.items() if whose == eye)", "self.doses.items())", T_BOOK),
@@ -311,7 +311,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(LEDGER, "given_j_per_cm2 - reserved.dose_j_per_cm2)", "given_j_per_cm2)", T_BOOK),
     Mutant(LEDGER, "total = self.spent(eye) + dose_j_per_cm2\n", "total = self.spent(eye)\n", T_BOOK),
     Mutant(LEDGER, "DailyLightLimit if wait_s > LONGEST_REST_S", "DailyLightLimit if wait_s < LONGEST_REST_S", T_BOOK),
-    Mutant(BOOK, "            raise_to(state, copy)\n", "            pass\n", T_LOG),
+    Mutant(BOOK, "            raise_doses(state, copy)\n", "", T_LOG),
     Mutant(BOOK, "row.eye in EYES else EYES", "row.eye in EYES else ()", T_BOOK),
     Mutant(BOOK, "now_s=state.now_s, observed_s=state.observed_s)", "now_s=state.now_s, observed_s=0.0)", T_LOG),
     Mutant(COPY, "= max(state.doses.get(", "= min(state.doses.get(", T_LOG),

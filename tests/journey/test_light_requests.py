@@ -88,7 +88,14 @@ def request_lease(rig: Rig, key: str, **more: Any) -> bool:
     return bool(rig.request("POST", "/api/controller", json={"key": key} | more).json()["mine"])
 
 
-def test_a_live_picture_needs_the_control_lease(make_rig: MakeRig) -> None:
+LIT_BY: dict[str, dict[str, Any]] = {
+    "/api/captures": {"eye": "OD"},
+    "/api/calibration": {"serial": "1", "by": "A", "source_deg": 0.1},
+    "/api/calibration/trial-lenses": {"vertex_mm": 12, "eye_dpt": 0},
+}
+
+
+def test_light_needs_the_control_lease(make_rig: MakeRig) -> None:
     rig, mine, other = make_rig(), secrets.token_hex(8), secrets.token_hex(8)
     assert live_status(rig) == 200, "without a key while no screen holds the lease"
     assert request_lease(rig, mine)
@@ -98,8 +105,13 @@ def test_a_live_picture_needs_the_control_lease(make_rig: MakeRig) -> None:
     for headers in strangers:
         answer = rig.request("GET", "/api/preview?after=0&eye=OD", headers=headers)
         assert (answer.status_code, answer.json()["code"]) == (409, "link.other")
+        for path, body in LIT_BY.items():
+            answer = rig.request("POST", path, json=body, headers=headers)
+            assert (answer.status_code, answer.json()["code"]) == (409, "link.other"), path
     assert rig.world.frames == frames
     assert live_status(rig, key=mine) == 200
+    press = rig.request("POST", "/api/captures", json=LIT_BY["/api/captures"], headers={"X-Controller": mine})
+    assert press.status_code == 201
     assert request_lease(rig, other, take=True)
     assert live_status(rig, key=mine) == 409
 

@@ -407,7 +407,7 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
         )
         assert answer["remedy"] == "Another screen is taking pictures."
         assert old_rig.request("POST", path, json={"key": next(keys), **body}, headers=mine).status_code == 201
-    begin(old_rig)  # without the header: a script, or the button of the instrument
+    begin(old_rig)  # without the header: a script
     taken = post(old_rig, "/api/controller", key=other["X-Controller"], take=True)
     assert taken["mine"] is True
     body = {"key": next(keys)}

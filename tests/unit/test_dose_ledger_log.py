@@ -1,5 +1,6 @@
 """Second copy of the dose ledger: no damage of table or file lowers a dose that was counted."""
 
+import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -10,6 +11,7 @@ from tempfile import TemporaryDirectory
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sqlalchemy.orm import Session
 
 from device.clock import VirtualClock
 from device.errors import LightLimit, StoreError
@@ -18,8 +20,8 @@ from device.values import EYES, Eye
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG, MAX_BYTES, DoseLedgerLog
-from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.snapshots import Snapshots
+from services.records.dose_ledger_tables import DoseLedgerStore, add_given_dose
+from services.records.snapshots import Snapshots, carry_dose
 
 DAY_S, STOP = 86_400.0, 10.0
 
@@ -179,6 +181,66 @@ def test_a_restored_snapshot_lowers_no_dose(store: CaptureStore) -> None:
     snapshots.restore(snapshots.names()[0])
     with CaptureStore(store.folder, reserve_bytes=0) as restored, pytest.raises(LightLimit):
         ledger_of(restored, clock).reserve(("OD",), 1.0, STOP)
+
+
+@pytest.mark.parametrize("change", ["observed_s = 1e9", "now_s = -1e9", "observed_s = 1e9, boot = 'other'"])
+def test_a_later_time_in_the_tables_expires_no_dose(store: CaptureStore, change: str) -> None:
+    clock = VirtualClock()
+    ledger = ledger_of(store, clock)
+    ledger.settle(ledger.reserve(("OD",), 1.0, STOP), 0.75)
+    clock.sleep(60)
+    run(store.folder, f"UPDATE observed_time SET {change}")
+    assert ledger.spent_j_per_cm2("OD") == 0.75
+    assert ledger_of(store, clock).spent_j_per_cm2("OD") == 0.75
+    clock.sleep(DAY_S + 2 * INTERVAL_S)
+    assert ledger.spent_j_per_cm2("OD") == 0.0, "it expires by the time of the file"
+
+
+def test_a_later_time_in_the_file_expires_no_dose(store: CaptureStore) -> None:
+    ledger = ledger_of(store, VirtualClock())
+    ledger.settle(ledger.reserve(("OD",), 1.0, STOP), 0.75)
+    DoseLedgerLog(store.folder).append(DoseLedgerState({}, 1e9, "boot", 0.0))
+    assert ledger.spent_j_per_cm2("OD") == 0.75
+
+
+@pytest.mark.parametrize("change", ["dose_j_per_cm2 = 0", "interval = -1000", "eye = 'OS'"])
+def test_a_changed_row_lowers_no_dose(store: CaptureStore, change: str) -> None:
+    ledger = ledger_of(store, VirtualClock())
+    ledger.settle(ledger.reserve(("OD",), 1.0, STOP), 0.75)
+    run(store.folder, f"UPDATE doses SET {change}")
+    assert ledger.spent_j_per_cm2("OD") == 0.75
+    with pytest.raises(LightLimit):
+        ledger_of(store, VirtualClock()).reserve(("OD",), 0.5, 1.0)
+
+
+def test_the_dose_of_a_corrected_eye_is_in_both_copies(store: CaptureStore) -> None:
+    clock = VirtualClock()
+    ledger = ledger_of(store, clock)
+    clock.sleep(2 * DAY_S)
+    ledger.reserve(("OD",), 0.0, STOP)
+    run(store.folder, "UPDATE observed_time SET observed_s = 0")
+    with Session(store.engine) as session, session.begin():
+        add_given_dose(session, "OS", 0.5)
+    assert ledger.spent_j_per_cm2("OS") == 0.5
+    lose_rows(store.folder)
+    assert ledger.spent_j_per_cm2("OS") == 0.5
+
+
+def test_a_database_of_a_device_with_more_time_blocks_no_light_for_longer_than_a_day(tmp_path: Path) -> None:
+    for name, observed_s in (("old", 300 * DAY_S), ("new", 0.0)):
+        clock = VirtualClock()
+        with CaptureStore(tmp_path / name, reserve_bytes=0) as used:
+            ledger = ledger_of(used, clock)
+            clock.sleep(observed_s)
+            ledger.reserve(("OD",), 1.0, STOP)
+    carry_dose(tmp_path / "new" / "store.sqlite", tmp_path / "old" / "store.sqlite")
+    shutil.copy(tmp_path / "old" / "store.sqlite", tmp_path / "new" / "store.sqlite")
+    with CaptureStore(tmp_path / "new", reserve_bytes=0) as restored:
+        clock = VirtualClock()
+        ledger = ledger_of(restored, clock)
+        assert ledger.spent_j_per_cm2("OD") == 1.0
+        clock.sleep(DAY_S + 2 * INTERVAL_S)
+        assert ledger.spent_j_per_cm2("OD") == 0.0
 
 
 def test_the_file_does_not_grow_without_limit(tmp_path: Path) -> None:

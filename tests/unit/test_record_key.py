@@ -14,9 +14,10 @@ from device.light_safety.dose_ledger import DoseLedgerState
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG, DoseLedgerLog
+from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.programme import load_programme
 from services.records.record_document import RecordDocument, parse_document
-from services.records.record_files import RecordFiles
+from services.records.record_files import KEY_ID, RecordFiles
 from services.records.schema import DATABASE
 from services.records.store_check import Checked, check_store
 from services.records.visit_repository import VisitRepository
@@ -68,6 +69,28 @@ def test_a_rewritten_visit_is_not_restored_into_a_lost_database(tmp_path: Path, 
     with CaptureStore(tmp_path, reserve_bytes=0, key=KEY) as store:
         assert (len(store.recovery.patients), store.recovery.visits) == (1, [])
     assert checked_visits(tmp_path).damaged == [visit]
+
+
+@pytest.mark.parametrize("without_database", [False, True])
+@pytest.mark.parametrize("note", [None, b"0" * 64])
+def test_a_removed_or_changed_note_of_the_key_makes_no_file_new(
+    tmp_path: Path, visit: str, without_database: bool, note: bytes | None
+) -> None:
+    with CaptureStore(tmp_path, reserve_bytes=0, key=KEY) as store:
+        DoseLedgerStore(store.engine, VirtualClock(), 86_400.0)
+    rewrite(tmp_path, visit)
+    (tmp_path / KEY_ID).unlink()
+    if note is not None:
+        (tmp_path / KEY_ID).write_bytes(note)
+    if without_database:
+        (tmp_path / DATABASE).unlink()
+    for _ in range(2):
+        with CaptureStore(tmp_path, reserve_bytes=0, key=KEY) as store:
+            if without_database:
+                assert store.recovery.visits == []
+            else:
+                assert visits_of(store).get(visit).fields["vision_od"] == "6/60"
+    assert checked_visits(tmp_path).is_whole is not without_database
 
 
 @pytest.mark.parametrize("without_database", [False, True])

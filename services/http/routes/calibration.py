@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 from fastapi import APIRouter, Query, Response
+from fastapi.params import Depends
 
 from device.calibration.archive import Archive, StoredCalibration
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
@@ -41,10 +42,13 @@ STEP_FILES: dict[CalibrationTarget, str] = {"cap": "darks.npz", "screen": "flats
 PREVIEW_RESPONSES = file_responses("image/jpeg") | no_picture("no picture within 2 s, or no calibration runs")
 
 
-def calibration_router(arbiter: HeadArbiter) -> APIRouter:
-    """Return the router of the calibration."""
+def calibration_router(arbiter: HeadArbiter, lit: Depends) -> APIRouter:
+    """Return the router of the calibration; `lit` is the check of the control lease, which a start needs.
+
+    From then on the run owns the head, and no screen takes pictures.
+    """
     router = APIRouter()
-    for part in (_read_router(arbiter), _write_router(arbiter), _trial_lens_router(arbiter)):
+    for part in (_read_router(arbiter), _write_router(arbiter, lit), _trial_lens_router(arbiter, lit)):
         router.include_router(part)
     return router
 
@@ -83,15 +87,16 @@ def _read_router(arbiter: HeadArbiter) -> APIRouter:
     return router
 
 
-def _write_router(arbiter: HeadArbiter) -> APIRouter:
+def _write_router(arbiter: HeadArbiter, lit: Depends) -> APIRouter:
     """Return the router of the calibration endpoints that act."""
     router = APIRouter(prefix="/api/calibration")
 
-    @router.post("")
+    @router.post("", dependencies=[lit])
     def start(start: CalibrationStart) -> CalibrationAnswer:
         """Start a calibration, or resume an unfinished one.
 
-        409 while a calibration is under way or the instrument starts, 401 without a login.
+        409 while a calibration is under way, the instrument starts or another screen holds the control lease; 401
+        without a login.
         """
         root = arbiter.context.archive.root
         request = CalibrationRequest(root, start.serial, start.by, start.source_deg, source_mm=start.source_mm)
@@ -122,16 +127,17 @@ def _write_router(arbiter: HeadArbiter) -> APIRouter:
     return router
 
 
-def _trial_lens_router(arbiter: HeadArbiter) -> APIRouter:
+def _trial_lens_router(arbiter: HeadArbiter, lit: Depends) -> APIRouter:
     """Return the router of the endpoints that measure the head with trial lenses."""
     router = APIRouter(prefix="/api/calibration/trial-lenses")
 
-    @router.post("")
+    @router.post("", dependencies=[lit])
     def start_trial_lenses(start: TrialLensStart) -> CalibrationAnswer:
         """Start a run with trial lenses before a trainer eye, for a head with a calibration in force.
 
         Within the limits of the head a calibration with the offset is put in force, else nothing is changed. 409 while
-        a calibration is under way or the instrument starts, 423 without a valid calibration, 401 without a login.
+        a calibration is under way, the instrument starts or another screen holds the control lease; 423 without a
+        valid calibration, 401 without a login.
         """
         arbiter.calibrate(TrialLensRequest(LensBench(start.vertex_mm, PowerVector(start.eye_dpt))))
         return calibration_state(arbiter)
