@@ -22,6 +22,7 @@ PARTS = {  # table of values of a record: table of the record, column with the k
     "files": ("captures", "capture_id"),
     "identifiers": ("patients", "patient"),
     "answers": ("visits", "visit"),
+    "changes": ("visits", "visit"),
     "slot_decisions": ("visits", "visit"),
     "uploads": ("visits", "visit"),
 }
@@ -35,6 +36,7 @@ def upgrade() -> None:
     _create_doses()
     _create_patients()
     _create_visits()
+    _create_changes()
     _create_slots()
     _create_uploads()
     _create_requests()
@@ -160,6 +162,22 @@ def _create_visits() -> None:
         sa.Column("set_at", sa.Text, nullable=False),
         sa.CheckConstraint("json_valid(value)", name="answer_is_json"),
         sa.CheckConstraint("length(value) <= 2000", name="answer_is_short"),
+        sqlite_strict=True,
+    )
+
+
+def _create_changes() -> None:
+    op.create_table(
+        "changes",
+        sa.Column("visit", sa.Text, sa.ForeignKey("visits.id"), primary_key=True),
+        sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
+        sa.Column("at", sa.Text, nullable=False),
+        sa.Column("user", sa.Text, nullable=False),
+        sa.Column("field", sa.Text, nullable=False),
+        sa.Column("was", sa.Text, nullable=False),
+        sa.Column("value", sa.Text, nullable=False),
+        sa.Column("why", sa.Text),
+        sa.CheckConstraint("json_valid(was) AND json_valid(value)", name="change_is_json"),
         sqlite_strict=True,
     )
 
