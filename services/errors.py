@@ -34,6 +34,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── UsbDriveUnavailable           USB drive removed or not writable
 │   │   └── UsbDriveReadOnly          USB drive write-protected
 │   ├── RecordRemoved                 file removed to make room
+│   ├── RecordErased                  data of the patient were erased
 │   └── RecordNotFound (LookupError)  no such capture
 ├── UploadError                       upload of a visit failed
 │   ├── UploadDisabled                no receiver configured
@@ -284,6 +285,13 @@ class RecordRemoved(StoreError):
 
     code = "store.removed"
     default_remedy = "Look at the copy that was exported or sent, or in a backup."
+
+
+class RecordErased(StoreError):
+    """The data of the patient were erased: their key is gone, and with it the content of every copy."""
+
+    code = "store.erased"
+    default_remedy = "The data of this person were erased, as was asked for. Begin a new visit if they come again."
 
 
 class RecordNotFound(StoreError, LookupError):

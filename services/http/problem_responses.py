@@ -27,6 +27,7 @@ from services.errors import (
     ConfirmationRequired,
     CrossOriginRequest,
     LoginRequired,
+    RecordErased,
     RecordNotFound,
     RecordRemoved,
     RequestRefused,
@@ -51,6 +52,7 @@ from services.http.security import security_headers
 HTTP_STATUS: dict[type[DiffuscopeError], int] = {
     RecordNotFound: 404,
     RecordRemoved: 410,
+    RecordErased: 410,
     Busy: 409,
     RequestRefused: 409,
     ServerFull: 503,

@@ -20,6 +20,7 @@
     reserve.bin                   space for records on a full disk (reserve_file.py)
     replaced/                     what a restored backup replaced (restoration.py)
     record-key-id                 name of the key of the records' files (record_files.py)
+    patient-keys, patient-keys-copy  keys of the patients, two copies (patient_keys.py)
     .lock                         lock of the commands that change the folder
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A new row therefore has its
@@ -54,6 +55,8 @@ from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.capture_versions import CaptureVersions
 from services.records.earlier_stores import refuse_earlier_store
+from services.records.patient_index import use_keys
+from services.records.patient_keys import PatientKeys
 from services.records.quarantine import Quarantine
 from services.records.record_document import RecordDocument
 from services.records.record_files import CAPTURE_RECORD, RecordFiles
@@ -80,9 +83,10 @@ class CaptureStore:
     `newly_quarantined` holds the names in `quarantine/` of the folders moved there at this opening, `recovery` what was
     restored from the files of the records. With `refusal` the folder is a copy in memory (read_only_store.py): nothing
     is recovered or quarantined, and every change raises this error. `key` authenticates the files of records and dose
-    ledger: nothing is restored from one that another program wrote; None checks none. `quarantine`, `versions`, `space`
-    and `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a
-    lock file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log.
+    ledger: nothing is restored from one that another program wrote; None checks none. It also wraps `keys`, those of
+    the patients. `quarantine`, `versions`, `space` and `write_ahead_log` are the parts of the store for those matters.
+    Several threads may read while one writes; a lock file serialises writers across threads and processes. Opening and
+    closing checkpoint the write-ahead log.
     Errors at opening: StoreError, StoreFull, StoreDamaged.
     """
 
@@ -121,6 +125,8 @@ class CaptureStore:
             self.space = StoreSpace(free, self.engine, (self.removed, self.quarantine), reserve_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
+                self.keys = PatientKeys(folder, key)
+                use_keys(self.engine, self.keys)
                 damage = self._set_damaged_database_aside()
                 schema.make_private(database)
                 schema.migrate(self.engine, snapshots.create)

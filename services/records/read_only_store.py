@@ -37,7 +37,7 @@ def opened_store(folder: Path, clock: Clock, key: bytes | None = None) -> Iterat
         store = _opened(folder, clock, key)
     except (StoreFull, StoreReadOnly) as refusal:
         log.error("the store is opened for reading only: %s", refusal.message)
-        with _copy_opened(folder, clock, refusal) as copy:
+        with _copy_opened(folder, clock, refusal, key) as copy:
             yield copy
         return
     with store:
@@ -51,14 +51,14 @@ def _opened(folder: Path, clock: Clock, key: bytes | None) -> CaptureStore:
 
 
 @contextmanager
-def _copy_opened(folder: Path, clock: Clock, refusal: StoreError) -> Iterator[CaptureStore]:
+def _copy_opened(folder: Path, clock: Clock, refusal: StoreError, key: bytes | None) -> Iterator[CaptureStore]:
     with ExitStack() as undo:
         with storage_errors():
             in_memory = MEMORY if MEMORY.is_dir() else None
             place = Path(undo.enter_context(TemporaryDirectory(prefix="diffuscope-", dir=in_memory)))
             for source in sorted(folder.iterdir()):
                 _copy(source, place / source.name)
-        store = CaptureStore(place, reserve_bytes=0, free_bytes=lambda _: 0, clock=clock, refusal=refusal)
+        store = CaptureStore(place, reserve_bytes=0, free_bytes=lambda _: 0, clock=clock, refusal=refusal, key=key)
         yield undo.enter_context(store)
 
 

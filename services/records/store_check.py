@@ -127,10 +127,9 @@ def _records_in_rows(folder: Path, kind: Kind) -> Iterator[tuple[str, RecordDocu
             keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
             for start in range(0, len(keys), record_signing.PAGE_ROWS):
                 page = keys[start : start + record_signing.PAGE_ROWS]
-                whole = {record.key: record for record in record_signing.documents_of(session, kind, page)}
+                whole = {record.id: record for record in record_signing.documents_of(session, kind, page)}
                 for row in record_signing.rows_of(session, kind, page):
-                    document = whole.get(schema.record_key(row))
-                    yield row.patient_id if isinstance(row, schema.PatientRow) else row.id, document
+                    yield schema.record_key(row), whole.get(schema.record_key(row))
                 session.expire_all()
     finally:
         engine.dispose()
