@@ -1,13 +1,15 @@
-"""Rows of patients: the number of a known or new patient, and the counter of automatic numbers."""
+"""Rows of patients: the number of a known or new patient, the counter of automatic numbers, the patient of a visit."""
 
 import secrets
 
-from sqlalchemy import select
+from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
 
 from device.errors import InputError
-from services.records import numbering
-from services.records.schema import CounterRow, PatientRow
+from services.errors import RecordNotFound
+from services.records import numbering, schema
+from services.records.schema import CounterRow, PatientRow, VisitRow
+from services.records.storage_errors import storage_errors
 
 
 def patient_number(session: Session, prefix: str, number: str | None, made_at: str) -> str:
@@ -28,9 +30,23 @@ def patient_number(session: Session, prefix: str, number: str | None, made_at: s
             raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
         number = known or number
     if session.get(PatientRow, number) is None:
-        session.add(PatientRow(number=number, made_at=made_at, patient_id=secrets.token_hex(8)))
+        patient_id = secrets.token_hex(8)
+        schema.patient_keys_of(session.get_bind()).create(patient_id)
+        session.add(PatientRow(number=number, made_at=made_at, patient_id=patient_id))
         session.flush()
     return number
+
+
+def patient_of_visit(engine: Engine, visit: str | None) -> str:
+    """Return the id of the patient of a visit, "" without a visit; RecordNotFound if the visit is unknown."""
+    if visit is None:
+        return ""
+    query = select(PatientRow.patient_id).join(VisitRow, VisitRow.patient == PatientRow.number)
+    with storage_errors(), Session(engine) as session:
+        patient_id = session.scalar(query.where(VisitRow.id == visit))
+    if patient_id is None:
+        raise RecordNotFound(f"there is no visit named {visit!r}")
+    return patient_id
 
 
 def _is_mistyped(prefix: str, number: str) -> bool:

@@ -43,6 +43,7 @@ from device.errors import SettingError, StoreError
 from services.records.capture import Capture, CaptureReport
 from services.records.earlier_stores import refuse_earlier_tables
 from services.records.json_values import JsonValue
+from services.records.patient_keys import PatientKeys
 
 DATABASE = "store.sqlite"
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -412,6 +413,12 @@ def key_of(engine: Engine) -> bytes | None:
     """Return the key that authenticates the files of the store whose tables these are; None without one."""
     key: bytes | None = engine.get_execution_options()["file_key"]
     return key
+
+
+def patient_keys_of(engine: Engine | Connection) -> PatientKeys:
+    """Return the keys of the patients of the store whose tables these are."""
+    keys: PatientKeys = engine.get_execution_options()["patient_keys"]
+    return keys
 
 
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
