@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from device import atomic_io
+from services.errors import RecordNotFound
 from services.identity.audit_key import find_audit_key
 from services.running_time import announced, announcing, say
 
@@ -65,6 +66,8 @@ def copy(
     from services.records.capture_store import CaptureStore  # deferred: imports SQLAlchemy
     from services.records.storage_errors import storage_errors
 
+    if not (data / "captures").is_dir():
+        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
     with announcing("copying"), CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
         atomic_io.make_folder(output)
         for id in capture:
