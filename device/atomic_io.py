@@ -19,12 +19,18 @@ from pathlib import Path
 PRIVATE_FILE, PRIVATE_FOLDER = 0o600, 0o700  # of data about people and of keys, whatever the umask
 RESERVE_BYTES = 200_000_000  # left free for logs and updates of the operating system, which else may not boot
 # EFBIG is a limit on the length of one file: for the operator the same as a full disk.
+_MEMORY = Path("/dev/shm")
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 def free_bytes(folder: Path) -> int:
     """Return the free space of the file system of `folder` for unprivileged users, bytes; RESERVE_BYTES included."""
     return shutil.disk_usage(folder).free
+
+
+def memory_folder() -> Path | None:
+    """Return the folder of files in memory, for plain content that must not be on a disk; None if there is none."""
+    return _MEMORY if _MEMORY.is_dir() else None
 
 
 def free_files(folder: Path) -> float:

@@ -8,8 +8,15 @@ from numpy.typing import NDArray
 from device.clock import VirtualClock
 from services.imaging.picture_files import raw_tiff
 from services.imaging.raw_metadata import RawMetadata
+from services.records import blobs
 from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_store import CaptureStore
+from services.records.patient_keys import PatientKeys
+
+
+def kept_content(path: Path) -> bytes:
+    """Return the plain content of a file of a capture in a store without a key; the store is not changed."""
+    return blobs.read_file(path, PatientKeys(path.parents[2], None, readonly=True))
 
 
 def write_store(

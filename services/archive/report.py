@@ -17,10 +17,10 @@ from device.values import Image
 from services.archive.plan import read_plan
 from services.archive.result import PLAN, TABLE
 from services.archive.solve import read_linear
+from services.archive.source_files import earlier_picture
 from services.imaging.picture_files import to_jpeg
 from services.plot import Mark, Plot, Series, svg, value_axis
 from services.report_style import STYLE
-from services.research.montage_files import read_picture
 from services.research.reconstruct_file import write_or_raise
 
 SHOWN = 6  # pictures of the largest improvements, and of the largest losses
@@ -259,7 +259,7 @@ def _thumbnail(path: Path | None, simulated: bool, words: str) -> str:
     if path is None:
         return f"<span>no picture {words}</span>"
     try:
-        picture: Image = read_linear(path) if path.suffix in (".tiff", ".npy") else read_picture(path)
+        picture: Image = read_linear(path) if path.suffix in (".tiff", ".npy") else earlier_picture(path)
         jpeg = to_jpeg(np.nan_to_num(picture), SIDE_PX, simulated)
     except DiffuscopeError as error:
         return f"<span>{escape(error.message)}</span>"

@@ -3,7 +3,7 @@
 Nothing here needs Dask: a bare process computes the same bytes.
 """
 
-import shutil
+import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,13 +11,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.config.image_files import only_frame, read_image_file
 from device.config.marked_files import tiff_bytes
-from device.errors import CalibrationError, FrameError, PsfError, SettingError, SpecError
+from device.errors import CalibrationError, FrameError, PsfError, SettingError, SpecError, StoreError
 from device.recon.model.fft_plans import Planner
 from device.values import Colour, Image
-from services.archive.content import different_versions, digest_of, file_digest, software
+from services.archive.content import different_versions, digest_of, software
 from services.archive.plan import COLOUR_ROLES, PlannedCalibration, PlannedCapture, PlanSettings, Role
 from services.archive.result import (
     COLOUR_PICTURE,
@@ -28,9 +29,9 @@ from services.archive.result import (
     ResultFolder,
     encoded_document,
 )
+from services.archive.source_files import earlier_picture, source_content
 from services.imaging.raw_metadata import RawMetadata
 from services.lru_cache import LruCache
-from services.research.montage_files import read_picture
 from services.research.pair_scores import PairScorer
 from services.research.reconstruct_capture import (
     CaptureFrames,
@@ -127,7 +128,7 @@ class Solvers:
         if found := different_versions(task.software, software()):
             failure = Quarantined(name, "versions", f"{worker} has other versions: {found}", retry=True)
             return Outcome(name, 0.0, failure)
-        with TemporaryDirectory(prefix="capture-") as spool:
+        with TemporaryDirectory(prefix="capture-", dir=atomic_io.memory_folder()) as spool:
             made = self._made(task, Path(spool))
         if isinstance(made, Quarantined):
             return Outcome(name, self._clock.now_s() - begin_s, made)
@@ -150,14 +151,14 @@ class Solvers:
         return Outcome(name, self._clock.now_s() - begin_s)
 
     def _made(self, task: Task, spool: Path) -> "_Made | Quarantined":
-        """Return the reconstruction of a capture, from copies of its files that have the planned digests."""
+        """Return the reconstruction of a capture, from plain copies of its files that have the planned digests."""
         capture = task.capture
         name = task.capture.result
         try:
             frames = _copied_frames(capture, spool)
         except OSError as error:
             return Quarantined(name, "source", f"{error.filename}: {error.strerror}", "Give the source again.", True)
-        except FrameError as error:
+        except (FrameError, StoreError) as error:
             return Quarantined(name, "changed", error.message, error.remedy, retry=True)
         try:
             solved = self._solver(task)(frames)
@@ -205,14 +206,15 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
 
 
 def _copied(path: str, digest: str, folder: Path) -> Path:
-    """Return a copy of a file, whose content has the digest; FrameError for another content, OSError for none."""
-    folder.mkdir(exist_ok=True)
-    copy = folder / Path(path).name
-    shutil.copyfile(path, copy)
-    if file_digest(copy) != digest:
+    """Return a plain copy of a file, whose content has the digest; FrameError for another, else as `source_content`."""
+    content = source_content(Path(path))
+    if hashlib.sha256(content).hexdigest() != digest:
         raise FrameError(
             f"{Path(path).name} has another content than when it was planned", "Restore it, or make a new plan."
         )
+    folder.mkdir(exist_ok=True)
+    copy = folder / Path(path).name
+    copy.write_bytes(content)
     return copy
 
 
@@ -236,7 +238,7 @@ def _scores(picture: Image, capture: PlannedCapture) -> dict[str, float]:
     score = PairScorer(truth, inside)
     psnr, _, pcc = score(picture)
     found = {"psnr_db": psnr, "pcc": pcc}
-    if capture.before and (before := read_picture(Path(capture.before))).shape[:2] == truth.shape[:2]:
+    if capture.before and (before := earlier_picture(Path(capture.before))).shape[:2] == truth.shape[:2]:
         psnr, _, pcc = score(before)
         found |= {"before_psnr_db": psnr, "before_pcc": pcc}
     return found

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from device.errors import StoreError
+from services.archive.source_files import source_content
 from services.records.capture import CaptureReport
 
 
@@ -13,8 +15,8 @@ def earlier_figures(path: str) -> dict[str, object]:
     if not path:
         return {}
     try:
-        report = CaptureReport.parse(Path(path).read_text("utf-8"))
-    except (OSError, ValueError):
+        report = CaptureReport.parse(source_content(Path(path)).decode())
+    except (OSError, StoreError, ValueError):
         return {}
     verdict = report.verdict
     return {

@@ -1,4 +1,4 @@
-"""Command `diffuscope store check|rebuild`: check everything that is stored; rebuild the database from the files."""
+"""Command `diffuscope store check|rebuild|copy`: check all that is stored, rebuild the database, copy captures."""
 
 import json
 import sys
@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from device import atomic_io
+from services.errors import RecordNotFound
 from services.identity.audit_key import find_audit_key
 from services.running_time import announced, announcing, say
 
 if TYPE_CHECKING:
     from services.records.store_check import Checked
 
-app = typer.Typer(help="What is stored: check it, and rebuild the database from its files.", no_args_is_help=True)
+app = typer.Typer(help="What is stored: check it, rebuild its database, copy captures.", no_args_is_help=True)
 Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 
 
@@ -52,6 +54,25 @@ def rebuild(
             report = store.recovery
     counts = f"{len(report.patients)} patients, {len(report.visits)} visits and {len(report.adopted)} captures"
     typer.echo(f"The database has {counts} from the files. The one before is in {aside}.")
+
+
+@app.command()
+def copy(
+    capture: Annotated[list[str], typer.Argument(help="Ids of captures, names of folders in captures/.")],
+    data: Data,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the copies, a folder for each capture.")],
+) -> None:
+    """Copy captures without encryption: raw frames, pictures and report; they are pictures of a person."""
+    from services.records.capture_store import CaptureStore  # deferred: imports SQLAlchemy
+    from services.records.storage_errors import storage_errors
+
+    if not (data / "captures").is_dir():
+        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    with announcing("copying"), CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
+        atomic_io.make_folder(output)
+        for id in capture:
+            atomic_io.write_folder(output / id, {name: store.read(id, name) for name in store.get(id).files})
+    typer.echo(f"{output}: {len(capture)} captures")
 
 
 def table(results: list["Checked"]) -> str:

@@ -10,7 +10,7 @@ from device.clock import Clock
 from device.errors import StoreError
 from device.light_safety.hazard import light_limits
 from services.backup.backup_key import read_key
-from services.errors import BackupDamaged, RecordRemoved
+from services.errors import BackupDamaged, RecordErased, RecordRemoved
 from services.health.checks import PressTimes, StatusSnapshot
 from services.health.clock_source import clock_state
 from services.health.instrument_status import InstrumentStatus
@@ -118,7 +118,7 @@ def _store_status(store: CaptureStore, people: VisitRepository) -> tuple[list[Ca
         newest = store.captures(MAX_PRESSES)
         store.check_writable()
         for name in newest[0].files if newest else ():
-            with suppress(RecordRemoved):
+            with suppress(RecordRemoved, RecordErased):
                 store.read(newest[0].id, name)
         return newest, len(store.quarantine.orphans()), store.damaged() + people.damaged(), None
     except StoreError as error:

@@ -109,7 +109,7 @@ def resumed_frames(stored: ResumableCapture, calibration: Calibration, now_s: fl
 def _loaded(load: Callable[[], tuple[Frame, RawMetadata]]) -> tuple[Frame, RawMetadata]:
     try:
         return load()
-    except OSError as error:
+    except (OSError, StoreError) as error:
         raise FrameError(f"a frame cannot be read: {error}") from error
 
 

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from device import atomic_io
@@ -17,12 +18,13 @@ from device.errors import StoreError
 from device.user_files import files_in
 from device.values import EYES, Eye
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import digested_json, row_validation
+from services.records import blobs, digested_json, row_validation
 from services.records.capture import OtherColour
 from services.records.capture_store import CaptureStore
 from services.records.capture_target import FRAMES, OTHER_COLOURS
 from services.records.frame_writer import FrameWriter, StoredFrame, stored_frames
 from services.records.json_values import JsonObject
+from services.records.patient_rows import patient_of_visit
 from services.records.record_document import whole_number
 from services.records.storage_errors import storage_errors
 
@@ -73,7 +75,7 @@ class CaptureJournal:
     """
 
     def __init__(self, store: CaptureStore) -> None:
-        self._folder = store.folder / JOURNAL
+        self._store, self._folder = store, store.folder / JOURNAL
         self._writers: dict[str, FrameWriter] = {}
         self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
@@ -104,13 +106,15 @@ class CaptureJournal:
         """Write the journal entry of the capture `press`, durable on return; return the writer of its frames.
 
         `key`: idempotency key of its request; `planned`, `colours`: as in `ResumableCapture`. Errors: StoreFull,
-        StoreError.
+        StoreError, RecordNotFound for an unknown visit.
         """
+        patient_id = patient_of_visit(self._store.engine, press.visit)
+        encrypt = partial(blobs.encrypted, self._store.keys, patient_id)
         with storage_errors():
             entry = asdict(press) | {"key": key, "planned": planned, "colours": list(colours)}
             atomic_io.write_file(self._folder / f"{press.id}.json", digested_json.encoded(entry))
             atomic_io.fsync_folder(self._folder)
-        writer = self._writers[press.id] = FrameWriter(self._folder / press.id)
+        writer = self._writers[press.id] = FrameWriter(self._folder / press.id, encrypt)
         return writer
 
     def count_attempt(self, id: str) -> None:
@@ -159,7 +163,7 @@ class CaptureJournal:
         folder = self._folder / id
         if (writer := self._writers.pop(id, None)) is not None:
             writer.close(complete=True)
-        if not any(frame.is_lit for frame in stored_frames(folder)):
+        if not any(frame.is_lit for frame in stored_frames(folder, self._store.keys)):
             self.fail(id)
             return False
         with storage_errors():
@@ -195,7 +199,7 @@ class CaptureJournal:
         None, and its frames are deleted, without a lit one, without a readable entry or after MAX_ATTEMPTS.
         """
         folder = self._folder / press.id
-        frames = stored_frames(folder)
+        frames = stored_frames(folder, self._store.keys)
         if plan is None or not any(frame.is_lit for frame in frames) or _attempts(folder) >= MAX_ATTEMPTS:
             with suppress(StoreError):  # then the next opening deletes them
                 self._remove_frames(press.id)

@@ -2,7 +2,7 @@
 
     store.sqlite                  database: one row per stored capture; also visits and the dose ledger
     store.sqlite-wal              write-ahead log: rows that are not in the main file yet (write_ahead_log.py)
-    captures/<id>/<name>          files of each capture
+    captures/<id>/<name>          files of each capture, encrypted under the key of its patient (blobs.py)
     captures/<id>/record.json     what the rows of the capture hold (record_document.py)
     patients/<id>.json            what the rows of a patient hold
     visits/<id>.json              what the rows of a visit hold
@@ -49,7 +49,7 @@ from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError, StoreReadOnly
 from device.user_files import files_in
 from services.errors import RecordNotFound, RecordRemoved, StoreDamaged
-from services.records import blobs, capture_rows, row_validation, schema
+from services.records import blobs, capture_rows, patient_rows, row_validation, schema
 from services.records.blobs import FileContent
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
@@ -120,13 +120,13 @@ class CaptureStore:
             self.write_ahead_log = WriteAheadLog(database, self.engine)
             self.quarantine = Quarantine(self._captures, quarantine, self._lock, self.engine)
             self.removed = RemovedCaptures(self._captures, folder / "removed", self._lock)
-            self.versions = CaptureVersions(self._captures, self._lock, self.engine)
             free = FreeSpace(folder, free_bytes, free_files)
             self.space = StoreSpace(free, self.engine, (self.removed, self.quarantine), reserve_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
                 self.keys = PatientKeys(folder, key)
                 use_keys(self.engine, self.keys)
+                self.versions = CaptureVersions(self._captures, self._lock, self.engine, self.keys)
                 damage = self._set_damaged_database_aside()
                 schema.make_private(database)
                 schema.migrate(self.engine, snapshots.create)
@@ -159,17 +159,22 @@ class CaptureStore:
         write_rows: RowWriter | None = None,
         request: str | None = None,
     ) -> Capture:
-        """Store a capture and its files (name -> content); return it with their SHA-256 once it is durable.
+        """Store a capture and its files (name -> plain content); return it with their SHA-256 once it is durable.
 
         `write_rows` adds rows in the same transaction. `request`: reference of the press, as
         `IdempotentRequests.reference` returns it, stored in the record of the capture. Quarantined captures are deleted
-        if their space is needed; files that are on the disk already are linked.
+        if their space is needed; files that are on the disk already are linked, the others are encrypted.
         Errors: StoreFull, StoreLocked (everything written is removed); StoreReadOnly; StoreError (the id exists; or a
         write failed: the next opening quarantines the folder if it is incomplete and has no row); SettingError (invalid
-        id, file name or report, or no files).
+        id, file name or report, or no files); RecordNotFound (unknown visit).
         """
         _refuse_names(capture.id, files)
         capture = capture.with_files({name: _sha256(content) for name, content in files.items()})
+        patient_id = patient_rows.patient_of_visit(self.engine, capture.report.visit)
+        files = {
+            name: blobs.encrypted(self.keys, patient_id, content) if isinstance(content, bytes) else content
+            for name, content in files.items()
+        }
         row = schema.row_of(capture, {name: _length_bytes(content) for name, content in files.items()})
         row.request = request
         record = RecordDocument("capture", 1, capture_content(row, file_entries(row)))
@@ -247,10 +252,10 @@ class CaptureStore:
         return capture
 
     def read(self, id: str, name: str) -> bytes:
-        """Return the content of one file of a capture after a SHA-256 check.
+        """Return the plain content of one file of a capture after a SHA-256 check.
 
-        RecordNotFound for an unknown capture or file, RecordRemoved for a removed file, StoreDamaged if the file is
-        unreadable or has changed.
+        RecordNotFound for an unknown capture or file, RecordRemoved for a removed file, RecordErased for one of an
+        erased patient, StoreDamaged if the file is unreadable or has changed.
         """
         with self._reading() as session:
             row = _row(session, id)
@@ -259,7 +264,7 @@ class CaptureStore:
             raise RecordNotFound(f"{id} has no file named {name!r}")
         # The path is built from the row alone: path traversal through `id` or `name` is impossible.
         try:
-            content: bytes = (self._captures / row.id / name).read_bytes()
+            content = blobs.read_file(self._captures / row.id / name, self.keys)
         except OSError as error:
             if (removal := self.removed.removal(row.id)) is not None and is_large(name):
                 when = f"{removal.removed_at:%Y-%m-%d}"

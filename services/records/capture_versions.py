@@ -19,9 +19,11 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from services.errors import RecordNotFound, VersionRefused
-from services.records import row_validation, schema
+from services.records import blobs, row_validation, schema
 from services.records.capture import CaptureReport, CaptureVersion
 from services.records.capture_rows import NAME
+from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import patient_of_visit
 from services.records.record_signing import recorded
 from services.records.schema import CaptureRow, FileRow
 from services.records.storage_errors import storage_errors
@@ -53,8 +55,8 @@ class NewVersion:
 class CaptureVersions:
     """Versions of the captures in the folder `captures`; a lock file `lock` serialises writers."""
 
-    def __init__(self, captures: Path, lock: Path, engine: Engine) -> None:
-        self._captures, self._lock, self._engine = captures, lock, engine
+    def __init__(self, captures: Path, lock: Path, engine: Engine, keys: PatientKeys) -> None:
+        self._captures, self._lock, self._engine, self._keys = captures, lock, engine, keys
 
     def adopt(self, new: NewVersion, at: datetime) -> CaptureVersion:
         """Store a later picture as the next version of its capture; return it, or the version with this result.
@@ -82,15 +84,17 @@ class CaptureVersions:
         files = {version.picture: new.picture, version.report: new.report}
         files |= {} if new.colour is None else {version.colour: new.colour}
         place = self._captures / row.id
+        patient_id = patient_of_visit(self._engine, row.visit)
+        stored = {name: blobs.encrypted(self._keys, patient_id, content) for name, content in files.items()}
         try:
-            for name, content in files.items():
+            for name, content in stored.items():
                 atomic_io.write_atomically(place / name, content)
         except OSError:
             for name in files:
                 (place / name).unlink(missing_ok=True)
             raise
         row.files += [
-            FileRow(name=name, sha256=hashlib.sha256(content).hexdigest(), bytes=len(content))
+            FileRow(name=name, sha256=hashlib.sha256(content).hexdigest(), bytes=len(stored[name]))
             for name, content in files.items()
         ]
 

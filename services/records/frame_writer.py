@@ -3,29 +3,30 @@
     journal/<id>/dark.tiff, raw.tiff, raw-1.tiff, ..., raw-red.tiff    frames in the order of exposure
     journal/<id>/<name>.json                                           note of one frame: SHA-256, length, dose
 
-The note is written after its frame: a frame without a note, or with another SHA-256 than in its note, does not count.
-The store links the files into the folder of the capture (`blobs.write_folder`), so each frame is written once; there
-`raw.tiff` is the first frame that can be used.
+The frames are encrypted as the files of captures are. The note is written after its frame: a frame without a note, or
+with another SHA-256 than in its note, does not count. The store links the files into the folder of the capture
+(`blobs.write_folder`), so each frame is written once; there `raw.tiff` is the first frame that can be used.
 """
 
 import hashlib
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from device import atomic_io
-from device.errors import DiffuscopeError, FrameError
+from device.errors import DiffuscopeError, FrameError, StoreError
 from device.user_files import files_in
 from device.values import Frame
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
-from services.records import digested_json
+from services.records import blobs, digested_json
 from services.records.blobs import WrittenFile
 from services.records.json_values import JsonObject
+from services.records.patient_keys import PatientKeys
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +56,7 @@ class StoredFrame:
     number: int
     dose_j_per_cm2: float
     exposed_s: float
+    keys: PatientKeys = field(repr=False, compare=False)
 
     @property
     def is_lit(self) -> bool:
@@ -62,8 +64,8 @@ class StoredFrame:
         return _LIT.fullmatch(self.file.path.name) is not None
 
     def load(self) -> tuple[Frame, RawMetadata]:
-        """Return the frame and its metadata; OSError or FrameError if the file cannot be read."""
-        counts, metadata = picture_files.read_raw_tiff(self.file.path.read_bytes())
+        """Return the frame and its metadata; OSError, StoreError or FrameError if the file cannot be read."""
+        counts, metadata = picture_files.read_raw_tiff(blobs.read_file(self.file.path, self.keys))
         if metadata.exposure_s is None or metadata.simulated is None:
             raise FrameError(f"{self.file.path.name} has no exposure time, or no mark of its origin")
         light = metadata.illumination
@@ -74,13 +76,14 @@ class StoredFrame:
 class FrameWriter:
     """Writer of the frames of one press into `folder`, in a thread of its own; the exposure does not wait for the disk.
 
+    `encrypt` returns the content of a file as it is on the disk.
     One thread calls `write`; `finish` and `close` may be called from any. The frames that wait are those of one press,
     which are in memory anyway, and one encoded frame more. After an error of the disk nothing more is written: the
     press goes on with its frames in memory.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, encrypt: Callable[[bytes], bytes]) -> None:
+        self._folder, self._encrypt = folder, encrypt
         self._executor = ThreadPoolExecutor(1, "frames")  # starts its thread with the first frame
         self._written: dict[int, Future[WrittenFile | None]] = {}
         self._has_failed = False
@@ -107,8 +110,9 @@ class FrameWriter:
         try:
             atomic_io.make_folder(self._folder)
             content = picture_files.raw_tiff(taken.frame.counts, taken.metadata)
-            file = WrittenFile(path, hashlib.sha256(content).hexdigest(), len(content))
-            atomic_io.write_file(path, content)
+            stored = self._encrypt(content)
+            file = WrittenFile(path, hashlib.sha256(content).hexdigest(), len(stored))
+            atomic_io.write_file(path, stored)
             atomic_io.write_file(note, digested_json.encoded(_note_of(file, taken)))
             atomic_io.fsync_folder(self._folder)
         except (OSError, DiffuscopeError) as error:
@@ -121,16 +125,17 @@ class FrameWriter:
         return file
 
 
-def stored_frames(folder: Path) -> tuple[StoredFrame, ...]:
+def stored_frames(folder: Path, keys: PatientKeys) -> tuple[StoredFrame, ...]:
     """Return the whole frames in the folder of an interrupted press, in the order of their exposure.
 
-    A frame that is incomplete, has changed or has no note is left out, with a line in the log. Empty without a folder.
+    A frame that is incomplete, changed, erased or without a note is left out, with a line in the log. Empty without a
+    folder.
     """
     found = []
     for note in files_in(folder, "*.tiff.json"):
         try:
-            found.append(_checked(folder / note.stem, digested_json.decoded(note.read_bytes())))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            found.append(_checked(folder / note.stem, digested_json.decoded(note.read_bytes()), keys))
+        except (OSError, StoreError, ValueError, KeyError, TypeError) as error:
             log.warning("%s of the interrupted capture %s is left out: %s", note.stem, folder.name, error)
     return tuple(sorted(found, key=lambda frame: frame.number))
 
@@ -145,13 +150,13 @@ def _note_of(file: WrittenFile, taken: TakenFrame) -> JsonObject:
     }
 
 
-def _checked(path: Path, note: JsonObject) -> StoredFrame:
-    """Return the frame of a note; ValueError if its file is not the one that was written, OSError if it is gone."""
-    content = path.read_bytes()
-    file = WrittenFile(path, hashlib.sha256(content).hexdigest(), len(content))
+def _checked(path: Path, note: JsonObject, keys: PatientKeys) -> StoredFrame:
+    """Return the frame of a note; ValueError if its file is not the one that was written, or as `blobs.read_file`."""
+    content = blobs.read_file(path, keys)
+    file = WrittenFile(path, hashlib.sha256(content).hexdigest(), path.stat().st_size)
     if (file.sha256, file.length_bytes) != (note["file_sha256"], note["length_bytes"]):
         raise ValueError(f"{file.length_bytes} bytes that are not those of its note")
     number, dose_j_per_cm2, exposed_s = (note[name] for name in ("number", "dose_j_per_cm2", "exposed_s"))
     if not isinstance(number, int) or not isinstance(dose_j_per_cm2, float) or not isinstance(exposed_s, float):
         raise TypeError("its note has values of other types")
-    return StoredFrame(file, number, dose_j_per_cm2, exposed_s)
+    return StoredFrame(file, number, dose_j_per_cm2, exposed_s, keys)

@@ -37,14 +37,17 @@ class PatientKeys:
     """Keys of the patients of the store in `folder`, wrapped by the store's `key`; None: by a key that is public.
 
     Opening heals what is damaged in one copy, and makes the key of the device. Thread-safe; other processes may use the
-    same files. OSError if the disk refuses.
+    same files. With `readonly` nothing is written: keys are only read. OSError if the disk refuses.
     """
 
-    def __init__(self, folder: Path, key: bytes | None) -> None:
+    def __init__(self, folder: Path, key: bytes | None, readonly: bool = False) -> None:
         self._paths = [folder / name for name in FILES]
         self._wrapping = _wrapping(key)
         self._places = dict[str, int]()  # of the slots, by patient id; replaced as a whole
         self._size = 0  # of the files, in slots, when the places were read
+        if readonly:
+            self._read_places()
+            return
         for path in self._paths:
             open(path, "ab", opener=atomic_io.private_opener).close()
         atomic_io.fsync_folder(folder)
@@ -103,7 +106,7 @@ class PatientKeys:
 
     def _read(self, patient_id: str) -> bytes | None:
         place = self._places.get(patient_id)
-        for path in self._paths if place is not None else ():
+        for path in filter(Path.exists, self._paths) if place is not None else ():
             with path.open("rb", buffering=0) as file:
                 file.seek((place or 0) * SLOT_BYTES)
                 found = _parsed(file.read(SLOT_BYTES))
@@ -116,7 +119,7 @@ class PatientKeys:
         return nonce + self._wrapping.encrypt(nonce, key, _context("key", patient_id))
 
     def _slots_in_files(self) -> int:
-        return max(path.stat().st_size for path in self._paths) // SLOT_BYTES
+        return max(path.stat().st_size if path.exists() else 0 for path in self._paths) // SLOT_BYTES
 
     def _read_places(self) -> None:
         slots = _merged(*map(_slots_of, self._paths))

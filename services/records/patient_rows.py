@@ -1,18 +1,19 @@
-"""Rows of patients: a known or new patient by number, the encrypted identity, and the counter of automatic numbers."""
+"""Rows of patients: known or new patient by number, encrypted identity, counter of numbers, patient of a visit."""
 
 import secrets
 from collections.abc import Collection
 
-from sqlalchemy import select
+from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
 
 from device.errors import InputError, StoreError
-from services.errors import StoreDamaged
+from services.errors import RecordNotFound, StoreDamaged
 from services.records import numbering
 from services.records.json_values import FormValue, JsonObject, JsonValue
 from services.records.patient_index import NUMBER, index_of
 from services.records.row_validation import REMEDY
-from services.records.schema import CounterRow, PatientRow
+from services.records.schema import CounterRow, PatientRow, VisitRow
+from services.records.storage_errors import storage_errors
 
 MAX_OF_ONE_NUMBER = 99  # patients that got the same number after restorations of older tables
 
@@ -92,6 +93,17 @@ def give_free_number(session: Session, row: PatientRow) -> bool:
     if number != described:
         row.identity = index.encrypted(id, {NUMBER: number, **fields})
     return number == described
+
+
+def patient_of_visit(engine: Engine, visit: str | None) -> str:
+    """Return the id of the patient of a visit, "" without a visit; RecordNotFound if the visit is unknown."""
+    if visit is None:
+        return ""
+    with storage_errors(), Session(engine) as session:
+        patient_id = session.scalar(select(VisitRow.patient).where(VisitRow.id == visit))
+    if patient_id is None:
+        raise RecordNotFound(f"there is no visit named {visit!r}")
+    return patient_id
 
 
 def _is_mistyped(prefix: str, number: str) -> bool:

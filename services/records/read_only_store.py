@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from device import atomic_io
 from device.clock import Clock
 from device.errors import StoreError, StoreFull, StoreReadOnly
 from services.records.capture_journal import JOURNAL
@@ -21,7 +22,6 @@ from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
 
-MEMORY = Path("/dev/shm")  # the folder of temporary files may be on the disk that refuses
 READ_FROM_DISK = ("captures", "calibrations", "quarantine", "damaged", "conflicts")
 NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "accuracy"})
 
@@ -54,7 +54,7 @@ def _opened(folder: Path, clock: Clock, key: bytes | None) -> CaptureStore:
 def _copy_opened(folder: Path, clock: Clock, refusal: StoreError, key: bytes | None) -> Iterator[CaptureStore]:
     with ExitStack() as undo:
         with storage_errors():
-            in_memory = MEMORY if MEMORY.is_dir() else None
+            in_memory = atomic_io.memory_folder()  # the folder of temporary files may be on the disk that refuses
             place = Path(undo.enter_context(TemporaryDirectory(prefix="diffuscope-", dir=in_memory)))
             for source in sorted(folder.iterdir()):
                 _copy(source, place / source.name)

@@ -13,10 +13,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from device.user_files import files_in
-from services.errors import RecordNotFound, StoreDamaged
-from services.records import record_signing, row_validation, schema
+from services.errors import RecordErased, RecordNotFound, StoreDamaged
+from services.records import blobs, record_signing, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
 from services.records.earlier_stores import refuse_earlier_store
+from services.records.patient_keys import PatientKeys
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles
 from services.records.recovery import damage_of
@@ -63,7 +64,7 @@ def check_store(folder: Path, progress: Progress, key: bytes | None = None) -> l
             rows = _records_in_rows(folder, kind) if database.is_whole else ()
             results.append(_checked_records(folder, files, kind, rows, documents))
         progress("reading the files of the captures")
-        results.append(_checked_files(folder, documents))
+        results.append(_checked_files(folder, documents, key))
     return results
 
 
@@ -148,14 +149,20 @@ def _ids_of_files(folder: Path, kind: Kind) -> list[str]:
     return [path.name for path in files_in(folder / "captures") if path.is_dir()]
 
 
-def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocument]) -> Checked:
-    """Compare each file of each whole capture record with its SHA-256."""
+def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocument], key: bytes | None) -> Checked:
+    """Decrypt each file of each whole capture record, and compare it with its SHA-256; erased ones are left out."""
+    keys = PatientKeys(folder, key, readonly=True)
     result = Checked("files of captures")
     for (kind, id), document in documents.items():
         files = document.content.get("files")
         for name, described in files.items() if kind == "capture" and isinstance(files, dict) else ():
             try:
-                content = (folder / "captures" / id / Path(name).name).read_bytes()
+                content = blobs.read_file(folder / "captures" / id / Path(name).name, keys)
+            except RecordErased:
+                continue
+            except StoreDamaged:
+                result.damaged.append(f"{id}/{name}")
+                continue
             except OSError:
                 if not is_large(name) or not (folder / "captures" / id / MARK).exists():
                     result.damaged.append(f"{id}/{name}")

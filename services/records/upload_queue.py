@@ -35,7 +35,7 @@ class QueuedVisit:
     `visit`: visit id; `number`: patient number; `tries`: number of attempts; `failing_since`: first failure; `error`,
     `message`: code and text of the last error (None: no error, or cleared). `stuck`: the visit needs help from a user,
     because the error is not ReceiverUnreachable, or because the receiver has been unreachable for longer than
-    STUCK_AFTER. `size_bytes`: size of its pictures and reports, 0 unless requested.
+    STUCK_AFTER. `size_bytes`: size on the disk of its pictures and reports, 0 unless requested.
     """
 
     visit: str

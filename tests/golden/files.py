@@ -97,9 +97,6 @@ def _make_data(folder: Path) -> None:
         rig.arbiter.close()
         ledger = DoseLedgerStore(rig.store.engine, clock, DAY_S, boot="once")
         ledger.reserve(("OS",), 0.001, 0.1)  # never settled: the process was killed
-        CaptureJournal(rig.store).begin(
-            InterruptedCapture("20260302T120500-OS-abcdef", "OS", "v", "L-nerve", 1), "0" * 16
-        )
         AccuracyExplorer(
             rig.store.folder / "accuracy", Path(place), clock, spec, lambda *_, **__: None, measure_scene
         ).choose("quick")
@@ -109,6 +106,8 @@ def _make_data(folder: Path) -> None:
             for candidate in rig.request("GET", "/api/visits").json()["visits"]
             if candidate["number"] == "B-7"
         )
+        lost = InterruptedCapture("20260302T120500-OS-abcdef", "OS", visit["id"], "L-nerve", 1)
+        CaptureJournal(rig.store).begin(lost, "0" * 16)
         (folder / "export.zip").write_bytes(rig.request("GET", f"/api/visits/{visit['id']}/export.zip").content)
         rig.store.close()
         torn = rig.store.folder / "captures" / ".20260302T120600-OD-fedcba.part"

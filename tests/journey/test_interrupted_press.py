@@ -2,7 +2,7 @@
 
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -15,13 +15,16 @@ from device.errors import DiffuscopeError, StoreFull
 from device.ports import Camera
 from device.values import ExposureSettings, Frame, Illumination
 from services.errors import Busy, ConsentDeclined
+from services.identity.audit_key import find_audit_key
 from services.instrument.capture_pipeline import INTERRUPTED
 from services.instrument.events import EventBus
 from services.instrument.exam_loop import POSTPONED, UNTIL_BACK
 from services.instrument.resumption import CALIBRATION_DARK, MADE_AT_START, NO_DARK, SHORTER
-from services.records import digested_json
+from services.records import blobs, digested_json
 from services.records.capture_journal import MAX_ATTEMPTS
 from services.records.capture_target import CaptureTarget
+from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import patient_of_visit
 from services.records.programme import load_programme
 from services.records.visit_repository import VisitRepository
 from tests.journey.conftest import Rig, until
@@ -29,6 +32,7 @@ from tests.journey.test_cli_server import Server
 from tests.simulated import small_head_toml
 
 KEY = "c" * 16
+PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", b"\xff\xd8\xff")  # first bytes of PNG, TIFF and JPEG
 
 
 class EndsAt:
@@ -51,9 +55,18 @@ class EndsAt:
 
 
 def written(store: Path) -> dict[str, bytes]:
-    """Return the frames of the press in progress that count: those with a whole note."""
+    """Return the frames of the press in progress that count, without their encryption: those with a whole note."""
+    keys = PatientKeys(store, find_audit_key(store), readonly=True)
     notes = sorted(store.glob("journal/*/*.tiff.json"))
-    return {note.stem: note.with_name(note.stem).read_bytes() for note in notes if is_whole(note)}
+    return {note.stem: blobs.read_file(note.with_name(note.stem), keys) for note in notes if is_whole(note)}
+
+
+def refuse_plain(store: Path, contents: Iterable[bytes]) -> None:
+    """Assert that no file of a data folder holds the first kilobyte of a content, or begins as a picture."""
+    files = {str(path): path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    assert {name for name, stored in files.items() if stored.startswith(PICTURES)} == set()
+    for content in contents:
+        assert {name for name, stored in files.items() if content[:1024] in stored} == set()
 
 
 def is_whole(note: Path) -> bool:
@@ -150,6 +163,29 @@ def test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key(
         assert list((rig.store.folder / "journal").iterdir()) == []
         visit = rig.request("GET", f"/api/visits/{before.visit}").json()
         assert visit["slots"]["R-centre"]["captures"] == [id]
+
+
+def test_no_file_of_the_data_folder_holds_a_frame_or_picture_without_encryption(
+    build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path
+) -> None:
+    before = interrupt(3)
+    assert len(before.frames) == 2
+    refuse_plain(tmp_path / "store", before.frames.values())
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo)
+        capture = rig.exam.press("OD", KEY, before.target).result(60)
+        until(lambda: rig.exam.state == "aim")
+        test_picture = rig.exam.press("OS").result(60)
+        until(lambda: rig.exam.state == "aim")
+        kept = [(made.id, name) for made in (capture, test_picture) for name in made.files]
+        assert {"raw.tiff", "picture.png", "quick.jpg", "report.json"} <= {name for _, name in kept}
+        refuse_plain(rig.store.folder, [rig.store.read(id, name) for id, name in kept])
+        patient_id = patient_of_visit(rig.store.engine, before.visit)
+        rig.store.keys.erase(patient_id)
+        for name in capture.files:
+            answer = rig.request("GET", f"/api/captures/{capture.id}/{name}")
+            assert (answer.status_code, answer.json()["code"]) == (410, "store.erased"), name
+        assert rig.store.read(test_picture.id, "picture.png")
 
 
 @pytest.mark.parametrize(("last", "frames"), [(1, set()), (2, {"dark.tiff"})])
@@ -277,7 +313,9 @@ def killed_press(server: Server, process: subprocess.Popen[bytes], data: Path, k
     process.wait()
     (id,) = [path.name for path in (data / "journal").iterdir() if path.is_dir()]
     assert not (data / "captures" / id).exists(), "the kill came too late, so the test shows nothing"
-    return KilledPress(id, request, written(data))
+    killed = KilledPress(id, request, written(data))
+    refuse_plain(data, killed.frames.values())
+    return killed
 
 
 def repeated_press(server: Server, killed: KilledPress) -> Any:

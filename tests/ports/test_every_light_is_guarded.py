@@ -92,6 +92,7 @@ WITHOUT_HEAD = {  # files, stores, simulated scenes: no part of a head is opened
     "snapshots restore",
     "store check",
     "store rebuild",
+    "store copy",
     "store backup",
     "store restore",
     "archive plan",

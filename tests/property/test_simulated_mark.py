@@ -51,6 +51,7 @@ from services.instrument.progress import Progress
 from services.instrument.visit_montage import join_pictures
 from services.instrument.watchdog import Watchdog
 from services.records.capture import Capture, CaptureReport, RecordOrigin
+from services.records.capture_store import CaptureStore
 from services.records.capture_target import CaptureTarget
 from services.research.frontier import measure_scene
 from services.research.frontier_thumbnails import Shown, thumbnail_panel
@@ -261,8 +262,9 @@ def test_adopted_pictures(tmp_path: Path, simulated: bool) -> None:
     (tmp_path / "store" / FILE).write_text(json.dumps({"uuid": HERE, "serial": "1"}))
     out = write_results(tmp_path / "out", [planned(tmp_path / "store", "one")], simulated=simulated)
     assert adopted(out, tmp_path / "store").adopted == 1
-    for name in ("picture-1.png", "colour-1.png"):
-        assert stated_mark(tmp_path / "store" / "captures" / "one" / name) is simulated, name
+    with CaptureStore(tmp_path / "store") as store:
+        for name in ("picture-1.png", "colour-1.png"):
+            assert stated_in(name, io.BytesIO(store.read("one", name))) is simulated, name
 
 
 @both
@@ -615,6 +617,7 @@ OTHER_COMMANDS = {
     "snapshots restore",
     "store check",
     "store rebuild",
+    "store copy",
     "store backup",
     "store restore",
     "archive plan",

@@ -1,18 +1,23 @@
 """Capture journal: interrupted captures after a power cut."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from device.clock import VirtualClock
 from device.values import Frame, Illumination
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.frame_sink import FrameSink
+from services.records import blobs
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import MAX_ATTEMPTS, CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
+from services.records.programme import load_programme
+from services.records.visit_repository import VisitRepository
 
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
 KEY = "0123456789abcdef"
@@ -25,16 +30,23 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
         yield store
 
 
-def test_a_stored_capture_is_not_interrupted_and_a_damaged_entry_still_gives_its_eye(store: CaptureStore) -> None:
+@pytest.fixture
+def visit(store: CaptureStore) -> str:
+    return VisitRepository(store.engine, load_programme(), VirtualClock()).begin(KEY).id
+
+
+def test_a_stored_capture_is_not_interrupted_and_a_damaged_entry_still_gives_its_eye(
+    store: CaptureStore, visit: str
+) -> None:
     folder = store.folder / "journal"
-    CaptureJournal(store).begin(InterruptedCapture("20260301T120000-OS-ab", "OS", "v", "L-nerve", 1))
+    CaptureJournal(store).begin(InterruptedCapture("20260301T120000-OS-ab", "OS", visit, "L-nerve", 1))
     (folder / "20260301T120001-OD-cd.json").write_bytes(b"{half")
     kept = Capture("20260301T120002-OD-ef", "OD", datetime(2026, 3, 1, tzinfo=UTC), True, "00ff", CaptureReport(), {})
     CaptureJournal(store).begin(InterruptedCapture(kept.id, "OD"))
     store.save(kept, {"raw.tiff": b"1"})
     found = CaptureJournal(store)
     assert found.interrupted == (
-        InterruptedCapture("20260301T120000-OS-ab", "OS", "v", "L-nerve", 1),
+        InterruptedCapture("20260301T120000-OS-ab", "OS", visit, "L-nerve", 1),
         InterruptedCapture("20260301T120001-OD-cd", "OD"),
     )
     assert not (folder / f"{kept.id}.json").exists()
@@ -43,10 +55,10 @@ def test_a_stored_capture_is_not_interrupted_and_a_damaged_entry_still_gives_its
 
 
 def test_a_test_picture_is_reported_in_one_run_and_a_picture_of_a_visit_until_it_is_repeated(
-    store: CaptureStore,
+    store: CaptureStore, visit: str
 ) -> None:
     test_picture = InterruptedCapture("20260301T120000-OD-ab", "OD")
-    of_visit = InterruptedCapture("20260301T120001-OS-cd", "OS", "v", "L-nerve", 0)
+    of_visit = InterruptedCapture("20260301T120001-OS-cd", "OS", visit, "L-nerve", 0)
     before = CaptureJournal(store)
     before.begin(test_picture)
     before.begin(of_visit)
@@ -58,7 +70,7 @@ def test_a_test_picture_is_reported_in_one_run_and_a_picture_of_a_visit_until_it
     assert CaptureJournal(store).interrupted == (of_visit,)
 
 
-PRESS = InterruptedCapture("20260301T120000-OD-ab", "OD", "v", "R-centre", 1)
+PRESS = InterruptedCapture("20260301T120000-OD-ab", "OD", None, None, 1)
 
 
 def press_with_frames(store: CaptureStore, press: InterruptedCapture = PRESS, lights: tuple[str, ...] = LIT) -> None:
@@ -71,12 +83,15 @@ def press_with_frames(store: CaptureStore, press: InterruptedCapture = PRESS, li
     writer.finish()
 
 
-def test_an_interrupted_press_with_a_lit_frame_is_resumable_with_its_key_and_plan(store: CaptureStore) -> None:
-    press_with_frames(store)
+def test_an_interrupted_press_with_a_lit_frame_is_resumable_with_its_key_and_plan(
+    store: CaptureStore, visit: str
+) -> None:
+    press = replace(PRESS, visit=visit, slot="R-centre")
+    press_with_frames(store, press)
     found = CaptureJournal(store)
     assert found.interrupted == ()
     (capture,) = found.resumable
-    assert (capture.press, capture.key, capture.planned, capture.colours) == (PRESS, KEY, 3, ("red",))
+    assert (capture.press, capture.key, capture.planned, capture.colours) == (press, KEY, 3, ("red",))
     assert [frame.file.path.name for frame in capture.frames] == ["raw.tiff", "raw-1.tiff"]
     found.end(PRESS.id)
     assert found.resumable == ()
@@ -134,7 +149,7 @@ def test_files_of_the_writer_are_linked_into_the_capture_and_outlast_the_journal
     journal = CaptureJournal(store)
     (capture,) = journal.resumable
     files = {frame.file.path.name: frame.file for frame in capture.frames}
-    before = {name: file.path.read_bytes() for name, file in files.items()}
+    before = {name: blobs.read_file(file.path, store.keys) for name, file in files.items()}
     inode = files["raw.tiff"].path.stat().st_ino
     kept = store.save(Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {**files, "report.json": b"{}"})
     journal.end(PRESS.id)

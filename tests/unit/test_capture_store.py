@@ -30,6 +30,7 @@ from services.records.quarantine import REQUIRED_FILES
 MEMORY = Path("/dev/shm")  # order does not depend on the disk, and the test makes many stores
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
 FILES = {"raw.tiff": b"raw" * 1000, "picture.png": b"", "report.json": b"{}"}
+MORE_BYTES = len("diffuscope \n") + 12 + 16  # header, nonce and tag of an encrypted file of a test picture
 
 
 def capture(name: str = "20260301T120000-OD-aa", taken_at: datetime = NOON, **report: object) -> Capture:
@@ -148,7 +149,7 @@ def test_a_flipped_bit_fails_the_checksum(store: CaptureStore) -> None:
     content = bytearray(path.read_bytes())
     content[1234] ^= 1
     path.write_bytes(content)
-    with pytest.raises(StoreDamaged, match="SHA-256"):
+    with pytest.raises(StoreDamaged, match=r"raw\.tiff of .* cannot be decrypted"):
         store.read(capture().id, "raw.tiff")
     assert store.read(capture().id, "report.json") == b"{}"
     path.unlink()
@@ -231,7 +232,7 @@ def test_a_missing_disk_is_a_store_error(store: CaptureStore) -> None:
 
 
 def test_too_little_space_is_refused_before_any_write(tmp_path: Path) -> None:
-    need = sum(map(len, FILES.values()))
+    need = sum(len(content) + MORE_BYTES for content in FILES.values())
     free = [1000 + need]
     with CaptureStore(tmp_path, reserve_bytes=1000, free_bytes=lambda folder: free[0]) as store:
         store.save(capture("fits"), FILES)
@@ -255,7 +256,7 @@ def test_quarantined_captures_are_deleted_oldest_first_when_a_new_one_needs_spac
             (tmp_path / "quarantine" / name).mkdir()
             (tmp_path / "quarantine" / name / "raw.tiff").write_bytes(bytes(size_bytes))
         assert store.quarantine.sizes_bytes() == dict.fromkeys(quarantined, size_bytes)
-        store.save(capture("new"), {"raw.tiff": bytes(1_000)})
+        store.save(capture("new"), {"raw.tiff": bytes(1_000 - MORE_BYTES)})
         assert list(store.quarantine.sizes_bytes()) == [*quarantined[1:]]
         assert store.space.captures_left() == 58  # 19,000 free bytes less a record, and 40,000 quarantined ones
         store.save(capture("newer"), {"raw.tiff": bytes(40_000)})
@@ -269,8 +270,8 @@ def test_the_free_space_is_counted_in_captures_of_mean_size(tmp_path: Path) -> N
     free = [50_000_000]
     with CaptureStore(tmp_path, reserve_bytes=10_000_000, free_bytes=lambda folder: free[0]) as store:
         assert store.space.captures_left() == 4  # by the default size of ten million bytes
-        store.save(capture("a"), {"raw": bytes(1000), "png": bytes(200)})
-        store.save(capture("b"), {"raw": bytes(600)})
+        store.save(capture("a"), {"raw": bytes(1000 - MORE_BYTES), "png": bytes(200 - MORE_BYTES)})
+        store.save(capture("b"), {"raw": bytes(600 - MORE_BYTES)})
         assert store.space.captures_left() == 40_000_000 // 900
         free[0] = 10_000_899
         assert store.space.captures_left() == 0
@@ -282,7 +283,7 @@ def test_free_files_are_counted_in_captures(tmp_path: Path) -> None:
     """A capture of two files takes four with its folder and its record; 16 files and those of one press stay free."""
     free = [math.inf]
     with CaptureStore(tmp_path, reserve_bytes=0, free_bytes=lambda _: 10**9, free_files=lambda _: free[0]) as store:
-        store.save(capture("a"), {"raw": bytes(1000), "png": bytes(200)})
+        store.save(capture("a"), {"raw": bytes(1000 - MORE_BYTES), "png": bytes(200 - MORE_BYTES)})
         assert (store.space.captures_left(), store.space.lacks_files()) == (10**9 // 1200, False)
         free[0] = 16 + 8 + 3 * 4
         assert (store.space.captures_left(), store.space.lacks_files()) == (4, True)

@@ -21,6 +21,7 @@ from device.errors import FrameError, SettingError
 from device.values import EYES, Illumination
 from services.imaging.picture_files import raw_tiff, read_png, read_raw_tiff, to_jpeg, to_png
 from services.imaging.raw_metadata import RawMetadata, metadata_entries, read_metadata
+from tests.stored_captures import kept_content
 
 SHAPES = [(120, 160), (270, 480), (600, 600), (1080, 1920), (480, 270), (100, 130), (500, 130), (270, 480, 3)]
 
@@ -225,9 +226,10 @@ def test_stored_metadata_are_read_whole_and_written_to_the_same_bytes() -> None:
     stored = sorted((KEPT / "data" / "captures").glob("[0-9]*/*.tiff"))
     assert len(stored) == 30
     for path in stored:
-        with tifffile.TiffFile(path) as tiff:
+        content = kept_content(path)
+        with tifffile.TiffFile(BytesIO(content)) as tiff:
             written = tiff.pages.first.description
-        metadata = read_raw_tiff(path.read_bytes())[1]
+        metadata = read_raw_tiff(content)[1]
         illumination = Illumination("red" if path.name == "raw-red.tiff" else "green")
         assert metadata.illumination == (illumination if path.name.startswith("raw") else None)
         assert metadata.id == path.parent.name

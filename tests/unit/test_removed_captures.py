@@ -145,7 +145,10 @@ def test_a_finished_visit_is_removable_once_it_was_sent_or_exported(tmp_path: Pa
         exports.write(finished[1].id, state, clock.wall())
         found = removal.removable()
         assert (found.visits, found.captures) == (2, {"exported": ["c1"], "sent": ["c0"]})
-        assert found.size_bytes == 2 * sum(len(FILES[name]) for name in FILES if is_large(name))
+        places = [tmp_path / "store" / "captures" / id for id in ("c0", "c1")]
+        large = [path for place in places for path in place.iterdir() if is_large(path.name)]
+        assert found.size_bytes == sum(path.stat().st_size for path in large)
+        assert len(large) == 2 * sum(map(is_large, FILES))
         removal.remove()
         assert removal.removable().visits == 0
         assert removal.undoable()[0] == 2

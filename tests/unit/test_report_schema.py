@@ -12,6 +12,7 @@ from device.values import ONLY_FRAME, ChannelUse, Report, SimulatedEffects
 from services.records.capture import CaptureReport, CaptureVersion, EyeConfirmation, EyeCorrection, RecordOrigin
 from services.research import report_schema
 from services.research.reconstruct_file import FileReport
+from tests.stored_captures import kept_content
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 KEPT = sorted(GOLDEN.glob("kept/data/captures/*/report.json"))
@@ -66,7 +67,7 @@ def test_every_key_of_every_report_has_a_description() -> None:
 @pytest.mark.parametrize("file", KEPT, ids=lambda path: path.parent.name)
 def test_report_of_a_kept_capture_is_valid(file: Path) -> None:
     """Every key is described."""
-    report = json.loads(file.read_text(encoding="utf-8"))
+    report = json.loads(kept_content(file))
     jsonschema_rs.validator_for(report_schema.report_schema()).validate(report)
     for name, words in NESTED.items():
         assert set(report[name] or {}) <= set(words), name
@@ -90,7 +91,7 @@ def test_report_of_files_is_valid() -> None:
 
 def test_wrong_type_is_found() -> None:
     """A schema that accepts everything would pass the tests above."""
-    report = json.loads(KEPT[0].read_text(encoding="utf-8"))
+    report = json.loads(kept_content(KEPT[0]))
     valid = jsonschema_rs.validator_for(report_schema.report_schema())
     assert not valid.is_valid(report | {"noise_dn": "9.6"})
     assert not valid.is_valid(report | {"quality": report["quality"] | {"structure_nats": "high"}})

@@ -67,6 +67,14 @@ def test_a_changed_file_of_a_capture_is_damaged(filled: tuple[Path, Shown], tmp_
     assert (status, found["files of captures"]["damaged"]) == (1, ["test/raw.tiff"])
 
 
+def test_a_copy_of_a_capture_is_readable_without_the_store(filled: tuple[Path, Shown], tmp_path: Path) -> None:
+    words = ["copy", "test", "--data", str(filled[0]), "--output", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    copied = {("test", path.name): path.read_bytes() for path in (tmp_path / "out" / "test").iterdir()}
+    assert copied == {place: content for place, content in filled[1].files.items() if place[0] == "test"}
+    assert isinstance(CliRunner().invoke(app, words).exception, StoreError), "a copy was replaced"
+
+
 def test_a_missing_database_is_healable_and_rebuild_restores_it(filled: tuple[Path, Shown], tmp_path: Path) -> None:
     folder = shutil.copytree(filled[0], tmp_path / "store")
     (folder / "store.sqlite").write_bytes(b"no database")

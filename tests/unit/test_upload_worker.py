@@ -183,8 +183,11 @@ def test_queued_visits_have_a_size_and_are_ordered_by_finish(setup: QueueSetup) 
     setup.take(second)
     for visit in (second, first):
         setup.finish(visit)
+    places = setup.store.folder / "captures"
+    sent_bytes = [path.stat().st_size for name in ("picture.png", "report.json") for path in places.glob(f"*/{name}")]
+    assert len(sent_bytes) == 4
     found = setup.queue.queued(sizes=True)
-    assert [(entry.visit, entry.size_bytes) for entry in found] == [(second, 2 * len(b"png{}")), (first, 0)]
+    assert [(entry.visit, entry.size_bytes) for entry in found] == [(second, sum(sent_bytes)), (first, 0)]
     assert [entry.visit for entry in setup.queue.queued(1)] == [second]
 
 

@@ -1,6 +1,6 @@
 // User actions by tap or key: one object of handlers that templates and keyboard share.
 
-import { acceptTime, fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
+import { acceptTime, fileErrorCode, getFolders, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
 import { get, otherEyeSlot, saveSetting, set, currentCapture } from "./state.js";
 import { applyKey, isNumber } from "./numbers.js";
@@ -126,6 +126,8 @@ const examActions = {
 };
 
 
+const FILE_FAULTS = { "store.removed": "fault.removed", "store.erased": "fault.erased" };
+
 const pictureActions = {
   // Show the mark "final" only after the viewer has drawn the final picture.
   pictureDrawn({ detail }) {
@@ -134,7 +136,7 @@ const pictureActions = {
 
   async pictureFault({ detail }) {
     if (detail.mark === "quick") return; // the final picture is still to come
-    const why = (await fileStatus(detail.url)) === REMOVED ? "fault.removed" : "fault.picture";
+    const why = FILE_FAULTS[await fileErrorCode(detail.url)] ?? "fault.picture";
     raiseAlert({ code: "picture", message: t(why), remedy: t(`${why}.remedy`), from: "press" });
   },
 

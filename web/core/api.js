@@ -68,10 +68,10 @@ export const getVisits = (query) => requestJson(`/api/visits?${new URLSearchPara
 export const getCapture = (id) => requestJson(`/api/captures/${encodeURIComponent(id)}`);
 export const getUploadQueue = () => requestJson("/api/upload-queue");
 export const getFolders = async () => (await requestJson("/api/exports")).folders;
-export const REMOVED = 410; // status of the file of a capture that was removed after a copy was made or sent
 
-/** Return the HTTP status of a file of a capture, 0 without an answer. */
-export const fileStatus = async (url) => (await fetch(url, { cache: "no-store" }).catch(() => null))?.status ?? 0;
+/** Return the error code of a file of a capture, "" without one. */
+export const fileErrorCode = async (url) =>
+  (await fetch(url, { cache: "no-store" }).then((answer) => answer.json()).catch(() => null))?.code ?? "";
 
 export const captureFileUrl = (capture, name) => `/api/captures/${encodeURIComponent(capture)}/${name}`;
 export const visitZipUrl = (visit) => `/api/visits/${encodeURIComponent(visit)}/export.zip`;
