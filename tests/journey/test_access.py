@@ -439,3 +439,4 @@ def test_without_room_for_the_audit_log_the_exam_goes_on(fresh: Rig, tmp_path: P
     log = AuditLog(tmp_path / "missing", b"k" * 32, fresh.clock)
     app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
     assert ask(app, "POST", "/api/visits", client=HERE, json={"key": "0" * 16}).status_code == 201
+    assert ask(app, "POST", "/api/captures", client=HERE, json={"eye": "OD"}).status_code == 201

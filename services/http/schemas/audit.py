@@ -15,7 +15,7 @@ class AuditEntryAnswer(ResponseBody):
 
 
 class AuditAnswer(ResponseBody):
-    """Entries, the number of valid ones in the whole log, and what its check found; null if it is as written."""
+    """Entries, the number of the last valid one, and what the check found; null if the entries are as written."""
 
     entries: list[AuditEntryAnswer]
     count: int
