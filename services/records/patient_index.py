@@ -31,8 +31,8 @@ class PatientIndex:
         self._lock = Lock()
         self._known: Mapping[str, tuple[str, str | None]] = {}  # encrypted identity and number by patient id
 
-    def encrypted(self, patient_id: str, value: JsonValue) -> str:
-        """Return a JSON value as encrypted text (base64); RecordErased or StoreDamaged without the patient's key."""
+    def encrypted(self, patient_id: str, value: object) -> str:
+        """Return a value of JSON as encrypted text (base64); RecordErased or StoreDamaged without the patient's key."""
         content = self.keys.encrypt(patient_id, json.dumps(value).encode(), "row")
         return base64.b64encode(content).decode()
 

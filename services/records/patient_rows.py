@@ -63,7 +63,7 @@ def identity(session: Session, id: str) -> tuple[str, JsonObject]:
 def set_field(session: Session, id: str, name: str, value: FormValue) -> JsonValue:
     """Set an identifying field of a patient, None to remove it; return its value before. Errors as in `identity`."""
     number, fields = identity(session, id)
-    kept = {NUMBER: number, **fields, name: value}
+    kept: dict[str, object] = {NUMBER: number, **fields, name: value}
     row = session.get_one(PatientRow, id)
     row.identity = index_of(session).encrypted(id, {key: known for key, known in kept.items() if known is not None})
     return fields.get(name)

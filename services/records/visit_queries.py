@@ -164,6 +164,7 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
             }
             return Visit(
                 row.id,
+                row.patient,
                 number,
                 _day(row.day),
                 row_validation.timestamp(row.begun_at),
