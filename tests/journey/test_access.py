@@ -22,6 +22,7 @@ from services.http.authentication import OWN_SCREEN, Authenticator, Peer
 from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
+from services.identity.setup_code import SetupCode
 from services.identity.users import ROLES, Role
 from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
@@ -228,7 +229,7 @@ def test_the_demonstration_ends_for_good_with_the_first_user(fresh: Rig) -> None
 
 
 def test_set_up_signs_in_the_first_administrator_once(fresh: Rig) -> None:
-    code = fresh.authenticator.users.setup_code()
+    code = SetupCode(fresh.store.folder.parent / "access", fresh.clock).create()
     asha = {"name": "Asha", "secret": PIN}
     wrong = ask(fresh.app, "POST", "/api/setup", json=asha | {"code": "AAAA-AAAA"})
     assert (wrong.status_code, wrong.json()["code"]) == (403, "access.wrong")
