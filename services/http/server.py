@@ -46,8 +46,7 @@ from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
 from services.identity.audit_key import load_or_create_audit_key
-from services.identity.certificates import check_validity
-from services.identity.certificates import host_names as certified_host_names
+from services.identity.certificates import check_validity, host_names
 from services.identity.renewal import AUTHORITY, SERVER
 from services.identity.users import FOLDER
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
@@ -94,6 +93,11 @@ class Listener:
     def is_local(self) -> bool:
         """Whether only this computer can connect."""
         return Client.at(str(self.socket.getsockname()[0])).is_local
+
+    @property
+    def host_names(self) -> list[str]:
+        """Host names of the certificate."""
+        return [] if self.certificate is None else host_names(self.certificate.read_bytes())
 
 
 def open_listeners(
@@ -219,26 +223,21 @@ def serve(
             event_log_routes(event_log, UsbDrives(), clock),
             backup_routes(backups, store, UsbDrives(), clock),
         ]
-        chains = [listener.certificate.read_bytes() for listener in listeners if listener.certificate is not None]
-        certified = tuple(name for chain in chains for name in certified_host_names(chain))
         authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, listeners), store.refusal, tls)
         app = create_app(
             arbiter,
             authenticator,
             programme,
-            own_host_names() + host_names + certified,
+            own_host_names() + host_names + tuple(name for listener in listeners for name in listener.host_names),
             technician_routers=routers,
             uploader=uploader,
             audit_log=_audit_log(store, key, clock),
         )
         _log_start(app.http.version, store)
-        secure = next((one.socket.getsockname()[1] for one in listeners if one.certificate is not None), 443)
-        apps = [pairing_app(tls, secure) if listener.is_pairing else app.http for listener in listeners]
-        servers = _limited_servers(apps, clock, context.event_bus, listeners)
+        servers = _limited_servers(app.http, tls, clock, context.event_bus, listeners)
         ready(not authenticator.users.has_begun and authenticator.user(None, OWN_SCREEN) is None)
         stop.register(servers[0])
-        sockets = [[listener.socket] for listener in listeners]
-        asyncio.run(_serve_together(servers, sockets))
+        asyncio.run(_serve_together(servers, listeners))
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
 
@@ -285,22 +284,25 @@ def _with_own_numbers(programme: Programme, store: CaptureStore) -> Programme:
 
 
 def _limited_servers(
-    apps: Sequence[FastAPI], clock: Clock, event_bus: EventBus, listeners: Sequence[Listener]
+    page: FastAPI, tls: Path, clock: Clock, event_bus: EventBus, listeners: Sequence[Listener]
 ) -> list["Server"]:
-    """Return a server of each listener's app; they share the limits of connections, the first one runs the lifespan."""
+    """Return a server for each listener; they share the limits of connections, and the first one runs the lifespan."""
     table, servers = ConnectionTable(ConnectionLimits(), clock), list[Server]()
-    for app, listener in zip(apps, listeners, strict=True):
+    secure_port = next((one.socket.getsockname()[1] for one in listeners if one.certificate is not None), 443)
+    for listener in listeners:
+        app = pairing_app(tls, secure_port) if listener.is_pairing else page
         options: dict[str, Any] = {"lifespan": "off"} if servers else {}
         if listener.certificate is not None:
             options |= {"ssl_certfile": listener.certificate, "ssl_ciphers": CIPHERS}
         config = LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1, **options)
+        config.load()
         servers.append(Server(config, event_bus))
     return servers
 
 
-async def _serve_together(servers: Sequence["Server"], sockets: Sequence[list[socket.socket]]) -> None:
+async def _serve_together(servers: Sequence["Server"], listeners: Sequence[Listener]) -> None:
     """Run all servers until the first one has ended."""
-    first, *others = [server.serve(own) for server, own in zip(servers, sockets, strict=True)]
+    first, *others = [server.serve([own.socket]) for server, own in zip(servers, listeners, strict=True)]
     tasks = [asyncio.create_task(other) for other in others]
     await first
     for server in servers:
