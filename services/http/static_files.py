@@ -1,4 +1,4 @@
-"""Static files of the two pages (exam, technician): served from memory, bundled, gzip-compressed.
+"""Static files of the pages (exam, technician, pairing): served from memory, bundled, gzip-compressed.
 
 Each URL under /web/ contains a hash of all files (cache-busting), so browsers may cache the answer for a year.
 """
@@ -27,14 +27,15 @@ MEDIA_TYPES = {
 PAGES = {
     "index.html": ("app.js", "styles/app.css"),
     "technician.html": ("technician/technician.js", "styles/technician_app.css"),
+    "pairing.html": ("pairing.js", "styles/pairing.css"),
 }
 IMMUTABLE = "public, max-age=31536000, immutable"  # cache-busting: changed files have another URL
 
 
 class StaticFiles:
-    """Files of both pages by URL, plain and gzip-compressed.
+    """Files of all pages by URL, plain and gzip-compressed.
 
-    All URLs except those of the two HTML files change when any file changes (cache-busting).
+    All URLs except those of the HTML files change when any file changes (cache-busting).
     """
 
     def __init__(self, folder: Path = resources.WEB) -> None:
@@ -67,7 +68,7 @@ class StaticFiles:
 
 @cache
 def page_files() -> StaticFiles:
-    """Return the files of both pages, read and bundled once per process: a changed file needs a restart anyway."""
+    """Return the files of all pages, read and bundled once per process: a changed file needs a restart anyway."""
     return StaticFiles()
 
 

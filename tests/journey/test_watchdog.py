@@ -2,6 +2,8 @@
 
 import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from services.http.server import inherited_socket
+from services.http.server import inherited_sockets
 from services.instrument.watchdog import BEAT_S, Watchdog
-from tests.journey.conftest import until
+from tests.journey.conftest import ROOT, until
 
 
 class NotifySocket:
@@ -124,6 +126,21 @@ def test_a_blocked_head_thread_sends_no_heartbeats(make_rig: Any, notify_socket:
 
 
 def test_a_passed_socket_is_accepted_only_by_its_addressee() -> None:
-    assert inherited_socket({}) is None
-    assert inherited_socket({"LISTEN_PID": str(os.getpid() + 1), "LISTEN_FDS": "1"}) is None
-    assert inherited_socket({"LISTEN_PID": str(os.getpid())}) is None
+    assert inherited_sockets({}) == {}
+    assert inherited_sockets({"LISTEN_PID": str(os.getpid() + 1), "LISTEN_FDS": "1"}) == {}
+    assert inherited_sockets({"LISTEN_PID": str(os.getpid())}) == {}
+
+
+def test_passed_sockets_have_the_names_of_their_units() -> None:
+    """In a process of its own, whose first sockets have the numbers 3 and 4, as those of systemd."""
+    code = """
+import os, socket
+made = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
+ports = [one.getsockname()[1] for one in made]
+assert [one.detach() for one in made] == [3, 4]
+from services.http.server import inherited_sockets
+names = "diffuscope.socket", "diffuscope-network.socket"
+given = {"LISTEN_PID": str(os.getpid()), "LISTEN_FDS": "2", "LISTEN_FDNAMES": ":".join(names)}
+assert [(name, one.getsockname()[1]) for name, one in inherited_sockets(given).items()] == list(zip(names, ports))
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
