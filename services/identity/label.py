@@ -28,7 +28,7 @@ def pairing_label(data: Path, stored: Path, tls: Path, port: int, clock: Clock) 
         urls = [f"http://{host}{'' if port == 80 else f':{port}'}/" for host in hosts or ["127.0.0.1"]]
         lines += [qr_code(f"{urls[0]}#code={code}" if code else urls[0]).decode() or "For a QR code install qrencode."]
         lines += [f"To pair a tablet, open one of: {'  '.join(urls)}", "SHA-256 fingerprint of the authority:"]
-        lines += re.findall(".{23}", shown)  # eight pairs in a line, as on the pairing page
+        lines += re.findall(r"(?:\S\S ?){8}", shown)  # eight pairs in a line, as on the pairing page
     else:
         lines.append(f"Open https://{host_names((tls / SERVER).read_bytes())[0]}/")
     lines.append(code and f"Set-up code, for two minutes and five tries: {code[:4]}-{code[4:]}")

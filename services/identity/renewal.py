@@ -22,8 +22,8 @@ REMEDY = "Replace programme.crt and programme.key by a valid pair. Until then th
 def renew_certificate(identity: Identity, stored: Path, output: Path, clock: Clock, root: Path = Path("/")) -> str:
     """Write a new server certificate for the present addresses into `output`; return why a programme's one is refused.
 
-    "" if none is. The pair programme.crt and programme.key in the folder `stored` of the identity is used instead, where
-    it is valid; then no authority is beside it. `root`: of the kernel's tables of addresses.
+    "" if none is. The pair programme.crt and programme.key in the folder `stored` of the identity is used where it is
+    valid; then no authority is beside it. `root`: of the kernel's tables of addresses.
     """
     problem, chain, key = "", stored / "programme.crt", stored / "programme.key"
     authority = identity.authority_key, identity.authority_crt
