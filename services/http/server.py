@@ -74,10 +74,7 @@ SD_LISTEN_FD = 3  # the file descriptor of sd_listen_fds(3)
 PAGE_SOCKET, NETWORK_SOCKET, PAIRING_SOCKET = (f"diffuscope{name}.socket" for name in ("", "-network", "-pairing"))
 RELOAD_TICKS = 10  # of 0.1 s, between two looks at the files of the certificate
 CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # of TLS 1.2; those of 1.3 are all good
-CERTIFICATE_REMEDY = (
-    "Make one with `diffuscope label`, or write key and chain as PEM into that file. "
-    "Or serve on 127.0.0.1, and reach it with `ssh -L 8000:127.0.0.1:8000 THIS-COMPUTER`."
-)
+REMEDY = "Make one with `diffuscope label`, or serve on 127.0.0.1, with `ssh -L 8000:127.0.0.1:8000 THIS-COMPUTER`."
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
@@ -119,19 +116,11 @@ def open_listeners(
             listener = Listener(opened, is_pairing=name == PAIRING_SOCKET)
             if not listener.is_local and not listener.is_pairing:
                 listener = Listener(opened, file)
-                _require_valid(file)
+                _check_certificate(file)
             if not listener.is_pairing or (tls / AUTHORITY).exists():
                 listeners.append(listener)
         undo.pop_all()
     return listeners
-
-
-def _require_valid(certificate: Path) -> None:
-    try:
-        check_validity(certificate, certificate, SystemClock())
-    except ValueError as error:
-        message = f"the address is open to the network, and the certificate {certificate} {error}"
-        raise InputError(message, CERTIFICATE_REMEDY) from error
 
 
 def bind_socket(host: str, port: int) -> socket.socket:
@@ -166,6 +155,13 @@ def inherited_sockets(environment: Mapping[str, str]) -> dict[str, socket.socket
     names = environment.get("LISTEN_FDNAMES", PAGE_SOCKET).split(":")
     numbers = range(SD_LISTEN_FD, SD_LISTEN_FD + int(environment.get("LISTEN_FDS", 0)))
     return {name: socket.socket(fileno=number) for name, number in zip(names, numbers, strict=False)}
+
+
+def _check_certificate(file: Path) -> None:
+    try:
+        check_validity(file, file, SystemClock())
+    except ValueError as error:
+        raise InputError(f"the network is served by TLS, and the certificate {file} {error}", REMEDY) from error
 
 
 def _remedy(error: OSError, port: int) -> str:
@@ -291,11 +287,8 @@ def _limited_servers(
     secure_port = next((one.socket.getsockname()[1] for one in listeners if one.certificate is not None), 443)
     for listener in listeners:
         app = pairing_app(tls, secure_port) if listener.is_pairing else page
-        options: dict[str, Any] = {"lifespan": "off"} if servers else {}
-        if listener.certificate is not None:
-            options |= {"ssl_certfile": listener.certificate, "ssl_ciphers": CIPHERS}
-        config = LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1, **options)
-        config.load()
+        options: dict[str, Any] = {"lifespan": "off" if servers else "auto", "ssl_certfile": listener.certificate}
+        config = LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1, ssl_ciphers=CIPHERS, **options)
         servers.append(Server(config, event_bus))
     return servers
 

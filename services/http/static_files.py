@@ -52,6 +52,10 @@ class StaticFiles:
             self._plain[html] = texts[html].replace('"/web/', f'"/{at}').encode()
         self._compressed = {name: gzip.compress(content, mtime=0) for name, content in self._plain.items()}
 
+    def text(self, html: str) -> str:
+        """Return the text of an HTML file."""
+        return self._plain[html].decode()
+
     def answer(self, request: Request, name: str, cache_control: str) -> Response:
         """Return the file at URL `name` (without the first slash), gzip-compressed if the browser accepts that.
 

@@ -1,8 +1,6 @@
-"""Certificate authority of one device, limited by name constraints (RFC 5280), and the server certificates it signs.
+"""Certificate authority of one device, limited by name constraints (RFC 5280) to its names and private addresses.
 
-A tablet that trusts the constrained authority trusts this device's names and private addresses only. The second
-authority certificate has the same key and no constraints, for tablets that refuse the extension
-(decisions/0003-one-key-two-authorities.md).
+`services/identity/decisions/0003-one-key-two-authorities.md` states why it has a second certificate without them.
 """
 
 import re
@@ -28,6 +26,7 @@ NETWORKS = tuple(ip_network(network) for network in PRIVATE.split())
 AUTHORITY_BEGIN = datetime(2020, 1, 1, tzinfo=UTC)
 AUTHORITY_END = datetime(2060, 1, 1, tzinfo=UTC)
 VALIDITY = timedelta(days=397)  # browsers refuse server certificates of 399 days or more from public authorities
+BUILD_DATE = datetime.fromtimestamp(int(Path(__file__).stat().st_mtime), UTC)  # an image has that of its commit
 CLOCK_TOLERANCE = timedelta(days=30)  # of a tablet whose clock is behind
 
 
@@ -50,11 +49,7 @@ def create_authority(name: str, clock: Clock) -> tuple[bytes, bytes, bytes]:
     The first certificate is limited to device `name` and private networks, the second one is not.
     """
     key = ec.generate_private_key(ec.SECP256R1())
-    permitted = [
-        x509.DNSName(SHARED_HOST_NAME),
-        x509.DNSName(f"{name}.local"),
-        *(x509.IPAddress(network) for network in NETWORKS),
-    ]
+    permitted = [x509.DNSName(SHARED_HOST_NAME), x509.DNSName(f"{name}.local"), *map(x509.IPAddress, NETWORKS)]
     subject = _distinguished_name(f"{name} made {clock.wall():%Y-%m-%d}")
     constrained = _signed_authority(key, subject, x509.NameConstraints(permitted, None))
     return _pem(key), constrained, _signed_authority(key, subject)
@@ -82,7 +77,7 @@ def create_server_certificate(
     key = ec.generate_private_key(ec.SECP256R1())
     named = dict.fromkeys([ACCESS_POINT_ADDRESS, *addresses])  # the access point may start later
     names = [x509.DNSName(SHARED_HOST_NAME), x509.DNSName(f"{name}.local"), *map(x509.IPAddress, named)]
-    start = max(_now(clock) - CLOCK_TOLERANCE, _build_date())
+    start = max(_now(clock) - CLOCK_TOLERANCE, BUILD_DATE)
     certificate = (
         _builder(_distinguished_name(name), issuer.subject, key.public_key())
         .not_valid_before(start)
@@ -121,14 +116,9 @@ def fingerprint(pem: bytes) -> str:
     return x509.load_pem_x509_certificate(pem).fingerprint(hashes.SHA256()).hex(" ").upper()
 
 
-def _build_date() -> datetime:
-    """Return the date of this program: the image sets the times of its files to that of the commit."""
-    return datetime.fromtimestamp(int(Path(__file__).stat().st_mtime), UTC)
-
-
 def _now(clock: Clock) -> datetime:
     """Return the time, or the date of the build for a clock that is before it."""
-    return max(clock.wall(), _build_date())
+    return max(clock.wall(), BUILD_DATE)
 
 
 def _builder(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey) -> x509.CertificateBuilder:

@@ -1,5 +1,6 @@
 """Text of `diffuscope label`: how a tablet is paired with this device, and the set-up code of a new one."""
 
+import re
 from pathlib import Path
 
 from device.clock import Clock
@@ -20,16 +21,15 @@ def pairing_label(data: Path, stored: Path, tls: Path, port: int, clock: Clock) 
     identity = load_or_create_identity(stored, Computer().serial(), clock)
     problem = renew_certificate(identity, stored, tls, clock)
     code = "" if UserTable(data / FOLDER).has_begun else SetupCode(tls, clock).create()
-    lines = [f"{identity.name}   serial {identity.serial}", problem or ""]
+    lines = [f"{identity.name}   serial {identity.serial}", problem]
     if (tls / AUTHORITY).exists():
-        shown = fingerprint((tls / AUTHORITY).read_bytes()).split()
+        shown = fingerprint((tls / AUTHORITY).read_bytes())
         hosts = [f"[{one}]" if one.version == 6 else str(one) for one in present_addresses() if not one.is_loopback]
         urls = [f"http://{host}{'' if port == 80 else f':{port}'}/" for host in hosts or ["127.0.0.1"]]
         lines += [qr_code(f"{urls[0]}#code={code}" if code else urls[0]).decode() or "For a QR code install qrencode."]
         lines += [f"To pair a tablet, open one of: {'  '.join(urls)}", "SHA-256 fingerprint of the authority:"]
-        lines += [" ".join(shown[row : row + 8]) for row in range(0, len(shown), 8)]
+        lines += re.findall(r"(?:\S\S ?){8}", shown)  # eight pairs in a line, as on the pairing page
     else:
         lines.append(f"Open https://{host_names((tls / SERVER).read_bytes())[0]}/")
-    if code:
-        lines.append(f"Set-up code, for two minutes and five tries: {code[:4]}-{code[4:]}")
+    lines.append(code and f"Set-up code, for two minutes and five tries: {code[:4]}-{code[4:]}")
     return "\n".join(line for line in lines if line)

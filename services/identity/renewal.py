@@ -14,22 +14,18 @@ from services.identity.certificates import check_validity, create_server_certifi
 from services.identity.provision import Identity, load_or_create_identity
 
 SERVER, AUTHORITY, UNCONSTRAINED = "server.pem", "authority.crt", "authority-unconstrained.crt"
-PROGRAMME_CHAIN, PROGRAMME_KEY = "programme.crt", "programme.key"
 OUTPUT = "run/diffuscope-tls"  # of the device
 GROUP_READABLE = 0o640  # the group of the folder is that of the server
-REMEDY = f"Replace {PROGRAMME_CHAIN} and {PROGRAMME_KEY} by a valid pair. Until then the device uses its own."
+REMEDY = "Replace programme.crt and programme.key by a valid pair. Until then the device uses its own certificate."
 
 
-def renew_certificate(
-    identity: Identity, stored: Path, output: Path, clock: Clock, root: Path = Path("/")
-) -> str | None:
+def renew_certificate(identity: Identity, stored: Path, output: Path, clock: Clock, root: Path = Path("/")) -> str:
     """Write a new server certificate for the present addresses into `output`; return why a programme's one is refused.
 
-    The pair programme.crt and programme.key in the folder `stored` of the identity is used instead, where it is valid;
-    then no authority is beside it. `root`: of the kernel's tables of addresses.
+    "" if none is. The pair programme.crt and programme.key in the folder `stored` of the identity is used where it is
+    valid; then no authority is beside it. `root`: of the kernel's tables of addresses.
     """
-    problem = None
-    chain, key = stored / PROGRAMME_CHAIN, stored / PROGRAMME_KEY
+    problem, chain, key = "", stored / "programme.crt", stored / "programme.key"
     authority = identity.authority_key, identity.authority_crt
     own = create_server_certificate(*authority, identity.name, clock, present_addresses(root))
     files = {AUTHORITY: identity.authority_crt, UNCONSTRAINED: identity.unconstrained_crt, SERVER: own}
@@ -52,4 +48,4 @@ if __name__ == "__main__":
     computer = Computer()
     stored = computer.data / "identity"
     identity = load_or_create_identity(stored, computer.serial(), SystemClock())
-    sys.stderr.write(renew_certificate(identity, stored, computer.root / OUTPUT, SystemClock()) or "")
+    sys.stderr.write(renew_certificate(identity, stored, computer.root / OUTPUT, SystemClock()))

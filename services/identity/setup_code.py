@@ -23,8 +23,8 @@ class SetupCode:
         """Return a new code, which replaces an earlier one."""
         code = "".join(secrets.choice(LETTERS) for _ in range(LENGTH))
         atomic_io.make_folder(self._file.parent)
-        content = f"{code} {boot_id()} {self._clock.now_s()}"
-        atomic_io.write_atomically(self._file, content.encode(), GROUP_READABLE)
+        content = f"{code} {boot_id()} {self._clock.now_s()}".encode()
+        atomic_io.write_atomically(self._file, content, GROUP_READABLE)
         return code
 
     def is_valid(self, typed: str) -> bool:

@@ -33,7 +33,7 @@ class Device(Server):
 
     def __init__(self, data: Path, head: Path) -> None:
         super().__init__(data, str(head))
-        self.pairing_port, self.ready_path = free_port(), "/api/pairing"
+        self.pairing_port, self.ready_path = free_port(), "/"
         self.more = ["--host", "0.0.0.0", "--pairing-port", str(self.pairing_port)]
         self.https = f"https://127.0.0.1:{self.port}"
         self.url = f"http://127.0.0.1:{self.pairing_port}"

@@ -250,7 +250,7 @@ def test_set_up_signs_in_the_first_administrator_once(fresh: Rig) -> None:
 def test_a_thousand_wrong_codes_end_the_code_and_are_in_the_audit_log(fresh: Rig, tmp_path: Path) -> None:
     """One each second, from two addresses; the right code is then refused, and a new label is accepted."""
     log = AuditLog(tmp_path, b"k" * 32, fresh.clock)
-    app = fresh.build_application(audit_log=log).http
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
     codes = SetupCode(fresh.store.folder.parent / "access", fresh.clock)
     code, asha = codes.create(), {"name": "Asha", "secret": PIN}
     answers: Counter[str] = Counter()

@@ -21,13 +21,6 @@ class SetUp(SignIn):
     code: str = Field(max_length=40)
 
 
-class PairingAnswer(ResponseBody):
-    """What a tablet needs to be paired: SHA-256 fingerprint of the authority, and the port of the page by TLS."""
-
-    fingerprint: str
-    https_port: int
-
-
 class SecretConfirmation(RequestBody):
     """Request body: the PIN or passphrase of the signed-in user."""
 
