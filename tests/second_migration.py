@@ -7,14 +7,14 @@ from device.clock import Clock
 from services.records import schema
 from services.records.snapshots import Snapshots
 
-FIRST, SECOND = "s0002", "s0003"
+FIRST, SECOND = "s0001", "s0002"
 MADE_UP = '''"""Add a note to each capture, and a table of notes."""
 
 import sqlalchemy as sa
 from alembic import op
 
-revision = "s0003"
-down_revision = "s0002"
+revision = "s0002"
+down_revision = "s0001"
 branch_labels = None
 depends_on = None
 
@@ -30,7 +30,7 @@ def upgrade() -> None:
 def with_second_migration(folder: Path) -> Path:
     """Return a new folder below `folder` with the migrations of this release and the made-up one."""
     migrations = Path(shutil.copytree(schema.MIGRATIONS, folder / "migrations"))
-    (migrations / "versions" / "s0003_made_up.py").write_text(MADE_UP, encoding="utf-8")
+    (migrations / "versions" / "s0002_made_up.py").write_text(MADE_UP, encoding="utf-8")
     return migrations
 
 

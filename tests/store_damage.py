@@ -27,6 +27,7 @@ from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG
 from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.patient_keys import FILES as KEYS
 from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue, UploadReceipt
@@ -269,7 +270,7 @@ def targets(folder: Path, which: str) -> list[Path]:
     of_records = [path for path in every if path.relative_to(folder).parts[0] in RECORD_FOLDERS]
     if which == "files":
         return of_records
-    others = {"calibrations", "journal", "access", KEY_FILE}
+    others = {"calibrations", "journal", "access", KEY_FILE, *KEYS}
     return [path for path in every if path.relative_to(folder).parts[0] in others]
 
 

@@ -1,4 +1,4 @@
-"""Folder of the backups of one device on a stick or path: encrypted objects that are written once.
+"""Folder of the backups of one device on a stick or path: encrypted objects that are written once, and keys.
 
     diffuscope-backup-<id>/
         README.txt              how to restore
@@ -6,7 +6,9 @@
         objects/<sha256>.age    one folder of the store (a capture), as an encrypted tar archive
         index.txt               append-only: name of each backed-up content, its object, and a seal (backup_key.py)
         backups/<number>.age    one backup: everything else in the store, and the list of its objects
+        patient-keys.age        keys of the patients, replaced by each backup; patient-keys-copy.age is the same
 
+The keys are overwritten in place, so that all backups lose the pictures and the name of a patient who was erased.
 An object is named by the SHA-256 of its encrypted content, so that a copy can be checked without a key. A line of the
 index is written after its object is durable, a backup after all of its objects: a backup that was interrupted leaves
 the earlier ones complete, and the next one continues.
@@ -24,6 +26,7 @@ from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
 
 PREFIX = "diffuscope-backup-"
+PATIENT_KEYS = ("patient-keys.age", "patient-keys-copy.age")
 _LINE = re.compile(r"([0-9a-f]{64}) ([0-9a-f]{64}) ([0-9]+) [0-9a-f]{64}")
 README = """Backups of one Diffuscope device, encrypted with age (https://age-encryption.org).
 
@@ -94,6 +97,18 @@ class BackupFolder:
         """Write a backup durably, after all of its objects, and read it back."""
         with drive_errors(self.folder):
             _write_and_read_back(backup_path(self.folder, number), encrypted)
+
+    def replace_keys(self, encrypted: bytes) -> None:
+        """Overwrite the keys of the patients durably, one copy after the other, and read them back."""
+        with drive_errors(self.folder):
+            for name in PATIENT_KEYS:
+                path = self.folder / name
+                with open(path, "r+b" if path.exists() else "wb", opener=atomic_io.private_opener) as file:
+                    file.write(encrypted)
+                    file.truncate()
+                atomic_io.fsync_file(path)
+                atomic_io.fsync_folder(self.folder)
+                _refuse_changed(path, encrypted)
 
     def _write_header(self, header: BackupHeader) -> None:
         """Write each copy of the header that is missing or unreadable; BackupDamaged if one is of other backups."""
@@ -188,5 +203,9 @@ def _write_and_read_back(path: Path, content: bytes) -> None:
     path.unlink(missing_ok=True)  # incomplete, or changed
     atomic_io.write_file(path, content)
     atomic_io.fsync_folder(path.parent)
+    _refuse_changed(path, content)
+
+
+def _refuse_changed(path: Path, content: bytes) -> None:
     if atomic_io.read_from_disk(path) != content:
         raise BackupDamaged(f"{path} cannot be read back as it was written")

@@ -167,7 +167,7 @@ def archive_builder(store: CaptureStore, people: VisitRepository) -> Callable[[s
     def build(id: str) -> VisitArchive:
         visit = people.get(id)
         if visit.finished_at is None:
-            raise Busy(f"{visit.number} was opened again")
+            raise Busy("the visit was opened again")
         name = folder_name(visit)
         return VisitArchive(name, zip_archive(name, uploaded_files(store, visit), visit.begun_at))
 

@@ -9,6 +9,7 @@ from services.records.programme import VISIONS
 
 Validator = Callable[[object], FormValue]
 COMPLAINTS = ("sudden_loss", "flashes", "pain", "red", "none")
+SPANS = ("<1", "1-5", "5-10", ">10", "unknown")  # years
 MAX_AGE_YEARS = 125
 
 
@@ -63,8 +64,8 @@ def _text(most: int) -> Validator:
 
 
 def _years(value: object) -> FormValue:
-    """Return a whole number of years, 0 to 100, or a text of up to 20 characters such as "<1" or "5-10"."""
-    return _text(20)(value) if isinstance(value, str) else _whole(100)(value)
+    """Return a whole number of years, 0 to 100, or one of SPANS: free text would have to be encrypted."""
+    return _choice(value, SPANS) if isinstance(value, str) else _whole(100)(value)
 
 
 def _yes_or_no(value: object) -> FormValue:

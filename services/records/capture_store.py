@@ -55,6 +55,7 @@ from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.capture_versions import CaptureVersions
 from services.records.earlier_stores import refuse_earlier_store
+from services.records.patient_index import use_keys
 from services.records.patient_keys import PatientKeys
 from services.records.quarantine import Quarantine
 from services.records.record_document import RecordDocument
@@ -124,7 +125,7 @@ class CaptureStore:
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
                 self.keys = PatientKeys(folder, key)
-                self.engine.update_execution_options(patient_keys=self.keys)
+                use_keys(self.engine, self.keys)
                 self.versions = CaptureVersions(self._captures, self._lock, self.engine, self.keys)
                 damage = self._set_damaged_database_aside()
                 schema.make_private(database)

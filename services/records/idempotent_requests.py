@@ -1,6 +1,7 @@
 """Idempotent requests: each completed request is stored with its key, so that a repeated one has no further effect."""
 
 import hashlib
+import hmac
 from collections.abc import Callable
 from datetime import timedelta
 
@@ -23,6 +24,7 @@ class IdempotentRequests:
 
     def __init__(self, engine: Engine, clock: Clock) -> None:
         self._engine, self._clock = engine, clock
+        self._key = schema.key_of(engine) or b""
         self._reserve = ReserveFile(schema.folder_of(engine))
 
     def run_in_transaction(self, key: str, request: str, act: Callable[[Session], str]) -> str:
@@ -61,30 +63,32 @@ class IdempotentRequests:
         before = session.get(IdempotencyKeyRow, key)
         if before is None:
             return None
-        if before.request != _digest(request):
+        if before.request != self._digest(request):
             raise key_conflict()
         return before.answer
 
     def store(self, session: Session, key: str, request: str, answer: str) -> None:
         """Add the key of a completed request to the transaction."""
         now = schema.utc_text(self._clock.wall())
-        session.add(IdempotencyKeyRow(key=key, request=_digest(request), answer=answer, done_at=now))
+        session.add(IdempotencyKeyRow(key=key, request=self._digest(request), answer=answer, done_at=now))
 
     def reference(self, key: str, request: str) -> str:
         """Return key and digest of a request, as the record that the request makes holds them."""
-        return f"{key} {_digest(request)}"
+        return f"{key} {self._digest(request)}"
 
     def delete_expired(self, session: Session) -> None:
         """Delete the keys that are older than KEY_RETENTION."""
         oldest = schema.utc_text(self._clock.wall() - KEY_RETENTION)
         session.execute(delete(IdempotencyKeyRow).where(IdempotencyKeyRow.done_at < oldest))
 
+    def _digest(self, request: str) -> str:
+        """Return the HMAC-SHA-256 (hexadecimal) of the text of a request, which may hold a patient number.
+
+        A repeat can be compared without storing the text, and without the store's key no text can be guessed.
+        """
+        return hmac.new(self._key, request.encode("utf-8", "backslashreplace"), hashlib.sha256).hexdigest()
+
 
 def key_conflict() -> IdempotencyKeyConflict:
     """Return the error for an idempotency key that was used for another request."""
     return IdempotencyKeyConflict("key: it belongs to another request")
-
-
-def _digest(request: str) -> str:
-    """Return the SHA-256 (hexadecimal) of the text of a request: a repeat can be compared without storing the text."""
-    return hashlib.sha256(request.encode("utf-8", "backslashreplace")).hexdigest()

@@ -30,13 +30,8 @@ class RecordDocument:
 
     @property
     def id(self) -> str:
-        """Id of the patient, the visit or the capture."""
+        """Id of the patient, the visit or the capture: the primary key of the row."""
         return row_validation.text(self.content["id"])
-
-    @property
-    def key(self) -> str:
-        """Primary key of the row: the number of the patient, or the id of the visit or the capture."""
-        return row_validation.text(self.content["number" if self.kind == "patient" else "id"])
 
     def sha256(self) -> str:
         """Return the SHA-256 (hexadecimal) of the canonical JSON of kind, revision and content."""

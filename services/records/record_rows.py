@@ -4,7 +4,6 @@ A record holds raw values of its rows, so that content read from restored rows i
 visit are not in its record: each capture's own record names visit and slot.
 """
 
-import base64
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -19,6 +18,7 @@ from device.values import EYES
 from services.records import numbering, row_validation
 from services.records.capture import CaptureReport
 from services.records.json_values import JsonObject, JsonValue
+from services.records.patient_rows import add_patient, give_free_number
 from services.records.record_document import Kind, as_list, as_object, whole_number
 from services.records.schema import (
     AnswerRow,
@@ -27,7 +27,6 @@ from services.records.schema import (
     ChangeRow,
     FileRow,
     IdempotencyKeyRow,
-    IdentifierRow,
     PatientRow,
     SlotDecisionRow,
     UploadRow,
@@ -35,8 +34,6 @@ from services.records.schema import (
 )
 
 CAPTURE_VALUES = ("eye", "taken_at", "simulated", "calibration_id", "report", "request")
-MAX_OF_ONE_NUMBER = 99  # patients that got the same number after restorations of older tables
-IDENTITY_VERSION = 1  # version of the encoding of the identifying fields
 Content = dict[str, JsonValue]
 R = TypeVar("R", PatientRow, VisitRow)
 FileEntry = tuple[Any, Any, Any]  # name, SHA-256 and length of a file, as the row has them
@@ -64,22 +61,13 @@ def capture_content(row: CaptureRow | Row[*tuple[Any, ...]], files: Iterable[Fil
     }
 
 
-def patient_contents(session: Session, rows: Sequence[PatientRow]) -> dict[str, Content | ValueError]:
-    """Return the content of each patient by number, or the error of reading its rows.
-
-    The identifying fields are one opaque text, which a later release may encrypt; `version` names its encoding.
-    """
-    numbers = row_validation.readable_keys(row.number for row in rows)
-    query = select(IdentifierRow).where(IdentifierRow.patient.in_(numbers))
-    fields = _grouped((row.patient, row.name, row.value) for row in session.scalars(query) if row is not None)
+def patient_contents(rows: Sequence[PatientRow]) -> dict[str, Content | ValueError]:
+    """Return the content of each patient by id, or the error of reading its row; its identity stays encrypted."""
 
     def content(row: PatientRow) -> Content:
-        values = {name: _parsed(value) for name, value in fields[row.number]}
-        blob = base64.b64encode(json.dumps(values, sort_keys=True).encode()).decode()
-        identity: Content = {"version": IDENTITY_VERSION, "blob": blob}
-        return {"id": row.patient_id, "number": row.number, "made_at": row.made_at, "identity": identity}
+        return {"id": row.patient_id, "made_at": row.made_at, "identity": row_validation.text(row.identity)}
 
-    return {row.number: _or_error(content, row) for row in rows}
+    return {row.patient_id: _or_error(content, row) for row in rows}
 
 
 def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Content | ValueError]:
@@ -93,9 +81,6 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
     changes = _grouped((row.visit, row.field, row) for row in changed if row is not None)
     sent = session.scalars(select(UploadRow).where(UploadRow.visit.in_(ids), UploadRow.sent_at.is_not(None)))
     uploads = _grouped((row.visit, row.finished_at, row) for row in sent if row is not None)
-    numbers = row_validation.readable_keys(row.patient for row in rows)
-    query = select(PatientRow.number, PatientRow.patient_id).where(PatientRow.number.in_(numbers))
-    patients: dict[str, str] = {row.number: row.patient_id for row in session.execute(query)}
 
     def content(row: VisitRow) -> Content:
         history: Content = {}
@@ -103,8 +88,7 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
             history["changes"] = [_change_content(change) for _, change in changes[row.id]]
         return history | {
             "id": row.id,
-            "patient_id": patients.get(row.patient),
-            "number": row.patient,
+            "patient_id": row.patient,
             "day": row.day,
             "begun_at": row.begun_at,
             "finished_at": row.finished_at,
@@ -120,49 +104,27 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
 
 
 def restore_patient(session: Session, content: JsonObject) -> bool:
-    """Write the rows of a patient as described; return whether the number could stay.
+    """Write the row of a patient as described; return whether the number could stay (`give_free_number`).
 
-    If another patient has the number, as after the restoration of older tables, this one gets the number with the first
-    free of the endings "-2", "-3", ...: two patients are never mixed up. ValueError, TypeError or KeyError for a
-    content of another form.
+    ValueError, TypeError or KeyError for a content of another form.
     """
-    row, identifiers = _patient_rows(content)
-    described = row.number
-    row.number = _free_number(session, described, row.patient_id)
-    for identifier in identifiers:
-        identifier.patient = row.number
-    session.execute(delete(IdentifierRow).where(IdentifierRow.patient == row.number))
+    row = _patient_row(content)
+    as_described = give_free_number(session, row)
     session.merge(row)
     session.flush()
-    session.add_all(identifiers)
-    session.flush()
-    return row.number == described
-
-
-def _free_number(session: Session, number: str, patient_id: str) -> str:
-    """Return the number that the patient with this id has, else the number itself or the first free one beside it."""
-    known = session.scalar(select(PatientRow.number).where(PatientRow.patient_id == patient_id))
-    if known is not None:
-        return known
-    candidates = (number, *(numbering.with_ending(number, f"-{count}") for count in range(2, MAX_OF_ONE_NUMBER + 1)))
-    for candidate in candidates:
-        if session.get(PatientRow, candidate) is None:
-            return candidate
-    raise ValueError(f"{MAX_OF_ONE_NUMBER} patients have the number {number!r:.60}")
+    return as_described
 
 
 def restore_visit(session: Session, content: JsonObject) -> bool:
-    """Write the rows of a visit as described, but its decisions on slots; return whether its patient has that number.
+    """Write the rows of a visit as described, but its decisions on slots; return whether its patient has a row.
 
-    A patient without rows gets a row with that number and no identifying field. Errors as in `restore_patient`.
+    A patient without one gets one with the patient id as number and no identifying field. Errors as in
+    `restore_patient`; RecordErased if such a patient was erased.
     """
     row, answers, changes, uploads, _ = _visit_rows(content)
-    described = row.patient
-    patient_id = row_validation.text(content["patient_id"])
-    row.patient = _free_number(session, described, patient_id)
-    if session.get(PatientRow, row.patient) is None:
-        session.add(PatientRow(number=row.patient, made_at=row.begun_at, patient_id=patient_id))
-        session.flush()
+    is_known = session.get(PatientRow, row.patient) is not None
+    if not is_known:
+        add_patient(session, row.patient, row.patient[: numbering.MAX_LENGTH].upper(), row.begun_at)
     session.execute(delete(AnswerRow).where(AnswerRow.visit == row.id))
     session.execute(delete(ChangeRow).where(ChangeRow.visit == row.id))
     session.execute(delete(UploadRow).where(UploadRow.visit == row.id, UploadRow.sent_at.is_not(None)))
@@ -173,7 +135,7 @@ def restore_visit(session: Session, content: JsonObject) -> bool:
     for upload in uploads:
         session.merge(upload)
     session.flush()
-    return row.patient == described
+    return is_known
 
 
 def restore_decisions(session: Session, content: JsonObject) -> list[str]:
@@ -192,7 +154,7 @@ def restore_decisions(session: Session, content: JsonObject) -> list[str]:
 
 def refuse_invalid(kind: Kind, content: JsonObject) -> None:
     """Raise ValueError, TypeError or KeyError if the content is none from which the rows can be restored."""
-    {"patient": _patient_rows, "visit": _visit_rows, "capture": capture_row}[kind](content)
+    {"patient": _patient_row, "visit": _visit_rows, "capture": capture_row}[kind](content)
 
 
 def capture_row(content: JsonObject) -> CaptureRow:
@@ -251,15 +213,12 @@ def _restore_request(session: Session, request: str | None, answer: str, at: str
         session.merge(IdempotencyKeyRow(key=key, request=digest, answer=answer, done_at=at))
 
 
-def _patient_rows(content: JsonObject) -> tuple[PatientRow, list[IdentifierRow]]:
-    """Return the rows that the content of a patient describes."""
-    number = row_validation.text(content["number"])
-    identity = as_object(content["identity"])
-    row_validation.one_of(identity["version"], IDENTITY_VERSION)
-    blob = base64.b64decode(row_validation.text(identity["blob"]), validate=True)
-    values = as_object(row_validation.parsed_json(blob.decode()))
-    row = PatientRow(number=number, made_at=_moment(content["made_at"]), patient_id=row_validation.text(content["id"]))
-    return row, [IdentifierRow(patient=number, name=name, value=json.dumps(value)) for name, value in values.items()]
+def _patient_row(content: JsonObject) -> PatientRow:
+    """Return the row that the content of a patient describes."""
+    identity = row_validation.text(content["identity"])
+    return PatientRow(
+        patient_id=row_validation.text(content["id"]), made_at=_moment(content["made_at"]), identity=identity
+    )
 
 
 def _visit_rows(
@@ -271,7 +230,7 @@ def _visit_rows(
     finished_at, sent, request = (_text_or_none(content[name]) for name in ("finished_at", "sent", "request"))
     row = VisitRow(
         id=id,
-        patient=row_validation.text(content["number"]),
+        patient=row_validation.text(content["patient_id"]),
         day=_day(content["day"]),
         begun_at=_moment(content["begun_at"]),
         finished_at=None if finished_at is None else _moment(finished_at),

@@ -66,7 +66,7 @@ def sign_changed(session: Session) -> list[RecordDocument]:
 def documents_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[RecordDocument]:
     """Return the records as their rows describe them, at the revision in the rows; without those that are unreadable.
 
-    `keys`: patient numbers, visit ids or capture ids.
+    `keys`: ids of patients, visits or captures.
     """
     rows = rows_of(session, kind, keys)
     contents = contents_of(session, kind, rows)
@@ -86,9 +86,9 @@ def rows_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[RecordRow
 
 
 def contents_of(session: Session, kind: Kind, rows: Sequence[RecordRow]) -> dict[str, Content | ValueError]:
-    """Return the content of each record by patient number, visit id or capture id, or the error of reading its rows."""
+    """Return the content of each record by id, or the error of reading its rows."""
     if kind == "patient":
-        return patient_contents(session, [row for row in rows if isinstance(row, PatientRow)])
+        return patient_contents([row for row in rows if isinstance(row, PatientRow)])
     if kind == "visit":
         return visit_contents(session, [row for row in rows if isinstance(row, VisitRow)])
     return {row.id: _capture_content(row) for row in rows if isinstance(row, CaptureRow)}
@@ -137,7 +137,7 @@ def write_signature(session: Session, document: RecordDocument) -> None:
     table = schema.RECORD_TABLES[document.kind]
     session.execute(
         update(table)
-        .where(schema.RECORD_KEYS[document.kind] == document.key)
+        .where(schema.RECORD_KEYS[document.kind] == document.id)
         .values(revision=document.revision, record_sha256=document.sha256())
         .execution_options(synchronize_session=False)
     )
@@ -151,7 +151,7 @@ def _write_as_before(session: Session, files: RecordFiles, written: Iterable[Rec
     try:
         with storage_errors():
             for document in written:
-                before = documents_of(session, document.kind, [document.key])
+                before = documents_of(session, document.kind, [document.id])
                 if before and before[0].revision > 0:
                     files.write(before)
                 else:

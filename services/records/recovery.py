@@ -50,7 +50,7 @@ from services.records.record_signing import (
 )
 from services.records.recovery_report import RecoveryReport
 from services.records.removed_captures import MARK, is_large
-from services.records.schema import CaptureRow, PatientRow, RecordRow
+from services.records.schema import CaptureRow, RecordRow
 from services.records.snapshots import move_to_numbered_folder, refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
 
@@ -125,14 +125,6 @@ class Recovery:
             RecordFiles(self._folder, self._new_key).write_all(_documents(session))
             note_key(self._folder, self._new_key)
 
-    def _id_in_file(self, damaged: PatientRow) -> str:
-        """Return the id of the patient whose file has the number of a damaged row, which may have another id."""
-        documents = (self._file("patient", id) for id in self._files.ids("patient"))
-        numbered = [
-            document for document in documents if document is not None and document.content["number"] == damaged.number
-        ]
-        return numbered[0].id if numbered else damaged.patient_id
-
     def _reconcile(self, session: Session, kind: Kind, of_visits: set[str] | None = None) -> list[RecordDocument]:
         """Compare the rows of all records of a kind with their files and restore rows; return the files to write.
 
@@ -146,10 +138,7 @@ class Recovery:
             contents = contents_of(session, kind, rows)
             for row in rows:
                 rows_document = _document_in_rows(kind, row, contents[schema.record_key(row)])
-                if isinstance(row, PatientRow) and rows_document is None and row.record_sha256 is not None:
-                    row.patient_id = self._id_in_file(row)
-                    session.flush()
-                id = row.patient_id if isinstance(row, PatientRow) else row.id
+                id = schema.record_key(row)
                 known.add(id)
                 if _is_settled(kind, row, rows_document, of_visits):
                     continue
@@ -280,7 +269,7 @@ def _delete_misnamed(session: Session, document: RecordDocument) -> None:
     table = schema.RECORD_TABLES[document.kind]
     session.execute(
         delete(table)
-        .where(table.record_sha256 == document.sha256(), schema.RECORD_KEYS[document.kind] != document.key)
+        .where(table.record_sha256 == document.sha256(), schema.RECORD_KEYS[document.kind] != document.id)
         .execution_options(synchronize_session=False)
     )
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import TypeVar, cast
 
-from services.errors import StoreDamaged
+from services.errors import RecordErased, StoreDamaged
 from services.records.json_values import FormValue, JsonValue
 
 REMEDY = "Its entry in the database is damaged. Nothing was removed from the disk. Call the technician."
@@ -34,12 +34,12 @@ def reading_record(name: object) -> Iterator[None]:
 
 
 def without_damaged(items: Sequence[Item], read: Callable[[Item], Value]) -> list[Value]:
-    """Return `read(item)` of each item, without the items for which `read` raises StoreDamaged."""
+    """Return `read(item)` of each item, without those for which `read` raises StoreDamaged or RecordErased."""
     out = []
     for item in items:
         try:
             out.append(read(item))
-        except StoreDamaged:
+        except (StoreDamaged, RecordErased):
             continue
     return out
 

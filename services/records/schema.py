@@ -43,7 +43,6 @@ from device.errors import SettingError, StoreError
 from services.records.capture import Capture, CaptureReport
 from services.records.earlier_stores import refuse_earlier_tables
 from services.records.json_values import JsonValue
-from services.records.patient_keys import PatientKeys
 
 DATABASE = "store.sqlite"
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -178,33 +177,20 @@ class ObservedTimeRow(Base):
 
 
 class PatientRow(RecordColumns, Base):
-    """One patient: patient number, time of creation (UTC), and an opaque random id; no identifying field."""
+    """One patient: an opaque random id, time of creation (UTC), and `identity`: the encrypted number, name and so on.
+
+    `identity` is the text of `PatientIndex.encrypted`.
+    """
 
     __tablename__ = "patients"
 
-    number: Mapped[str] = mapped_column(Text, primary_key=True)
+    patient_id: Mapped[str] = mapped_column(Text, primary_key=True)
     made_at: Mapped[str] = mapped_column(Text)
-    patient_id: Mapped[str] = mapped_column(Text)
+    identity: Mapped[str] = mapped_column(Text)
 
     __table_args__ = (
-        Index("patients_to_sign", "number", sqlite_where=text(UNSIGNED)),
-        CheckConstraint("length(number) BETWEEN 1 AND 20", name="number_is_short"),
-        {"sqlite_strict": True},
-    )
-
-
-class IdentifierRow(Base):
-    """One identifying field of a patient (name, phone, village), in a table of its own; `value` is JSON."""
-
-    __tablename__ = "identifiers"
-
-    patient: Mapped[str] = mapped_column(Text, ForeignKey("patients.number"), primary_key=True)
-    name: Mapped[str] = mapped_column(Text, primary_key=True)
-    value: Mapped[str] = mapped_column(Text)
-
-    __table_args__ = (
-        CheckConstraint("json_valid(value)", name="identifier_is_json"),
-        CheckConstraint("length(value) <= 2000", name="identifier_is_short"),
+        Index("patients_to_sign", "patient_id", sqlite_where=text(UNSIGNED)),
+        CheckConstraint("length(identity) <= 10000", name="identity_is_short"),
         {"sqlite_strict": True},
     )
 
@@ -213,7 +199,7 @@ NOT_UPLOADED = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at
 
 
 class VisitRow(RecordColumns, Base):
-    """One visit of the patient with number `patient`; `day` is the local date of its start, timestamps are UTC.
+    """One visit of the patient with the id `patient`; `day` is the local date of its start, timestamps are UTC.
 
     `finished_at` and `outcome` (JSON) are null in an unfinished visit. `request`: idempotency key of the request that
     began it and SHA-256 of that request, or null.
@@ -222,7 +208,7 @@ class VisitRow(RecordColumns, Base):
     __tablename__ = "visits"
 
     id: Mapped[str] = mapped_column(Text, primary_key=True)
-    patient: Mapped[str] = mapped_column(Text, ForeignKey("patients.number"))
+    patient: Mapped[str] = mapped_column(Text, ForeignKey("patients.patient_id"))
     day: Mapped[str] = mapped_column(Text)
     begun_at: Mapped[str] = mapped_column(Text)
     finished_at: Mapped[str | None] = mapped_column(Text)
@@ -266,7 +252,8 @@ class AnswerRow(Base):
 class ChangeRow(Base):
     """One change of a visit, number 1 first: time (UTC), user ("" for the device), form field, `outcome`, `laterality`.
 
-    `was` and `value` (JSON): before and after; `why`: reason of a reopening, or null. Rows are only added.
+    `was` and `value` (JSON): before and after, those of an identifying field as the text of `PatientIndex.encrypted`;
+    `why`: reason of a reopening, or null. Rows are only added.
     """
 
     __tablename__ = "changes"
@@ -376,12 +363,12 @@ RECORD_TABLES: dict[str, type[RecordRow]] = {
     "visit": VisitRow,
     "capture": CaptureRow,
 }
-RECORD_KEYS = {"patient": PatientRow.number, "visit": VisitRow.id, "capture": CaptureRow.id}
+RECORD_KEYS = {"patient": PatientRow.patient_id, "visit": VisitRow.id, "capture": CaptureRow.id}
 
 
 def record_key(row: RecordRow) -> str:
-    """Return the primary key of the row of a record: the number of a patient, the id of a visit or a capture."""
-    return row.number if isinstance(row, PatientRow) else row.id
+    """Return the primary key of the row of a record: the id of the patient, the visit or the capture."""
+    return row.patient_id if isinstance(row, PatientRow) else row.id
 
 
 def open_engine(path: Path, key: bytes | None = None) -> Engine:
@@ -413,12 +400,6 @@ def key_of(engine: Engine) -> bytes | None:
     """Return the key that authenticates the files of the store whose tables these are; None without one."""
     key: bytes | None = engine.get_execution_options()["file_key"]
     return key
-
-
-def patient_keys_of(engine: Engine | Connection) -> PatientKeys:
-    """Return the keys of the patients of the store whose tables these are."""
-    keys: PatientKeys = engine.get_execution_options()["patient_keys"]
-    return keys
 
 
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from device.clock import Clock
 from device.errors import DiffuscopeError
 from services.errors import ReceiverUnreachable
-from services.records import row_validation, schema
+from services.records import patient_rows, row_validation, schema
 from services.records.capture import COLOUR
 from services.records.record_signing import recorded
 from services.records.row_validation import reading_record, without_damaged
@@ -93,9 +93,9 @@ class UploadQueue:
         query = query.order_by(VisitRow.finished_at, VisitRow.id)
         with storage_errors(), Session(self.engine) as session:
             rows = session.execute(query.limit(limit)).all()
-            found = without_damaged(rows, lambda row: _waiting(*row))
+            found = without_damaged(rows, lambda row: _waiting(session, *row))
             if len(found) < len(rows):  # damaged rows must not use up the limit
-                found = without_damaged(session.execute(query).all(), lambda row: _waiting(*row))[:limit]
+                found = without_damaged(session.execute(query).all(), lambda row: _waiting(session, *row))[:limit]
             return _with_sizes(session, found) if sizes else found
 
     def status(self) -> QueueStatus:
@@ -172,14 +172,14 @@ class UploadQueue:
                 row.error = row.message = None
 
 
-def _waiting(visit: VisitRow, upload: UploadRow | None, stuck: bool | None) -> QueuedVisit:
+def _waiting(session: Session, visit: VisitRow, upload: UploadRow | None, stuck: bool | None) -> QueuedVisit:
     """Return a queue entry from its rows (`upload` None: no attempt yet); StoreDamaged if a row cannot be read.
 
     StoreDamaged too if `finished_at` is not in the notation of `schema.utc_text`: it would never equal `sent`.
     """
     with reading_record(visit.id):
         id = row_validation.text(visit.id)
-        number = row_validation.text(visit.patient)
+        number, _ = patient_rows.identity(session, row_validation.text(visit.patient))
         finished_at = row_validation.timestamp(visit.finished_at)
         row_validation.one_of(visit.finished_at, schema.utc_text(finished_at))
         if upload is None:

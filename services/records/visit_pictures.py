@@ -57,7 +57,7 @@ class VisitPictures:
         if programme_slot.eye != eye:
             raise InputError(f"{slot} is a picture of {programme_slot.eye}, not of {eye}", CHOOSE_REMEDY)
         if visit.finished_at is not None:
-            raise VisitFinished(f"{visit.number} is finished")
+            raise VisitFinished("this visit is finished")
         permit = self.permission(id)
         permit()
         tries = len(visit.slots[slot].captures)
@@ -107,11 +107,11 @@ class VisitPictures:
 
         def permit() -> None:
             with storage_errors(), Session(self._engine) as session:
-                number, consent = visit_queries.consent(session, id)
+                consent = visit_queries.consent(session, id)
             if consent == "declined":
-                raise ConsentDeclined(f"{number} did not agree to pictures")
+                raise ConsentDeclined("this person did not agree to pictures")
             if consent != "agreed":
-                raise ConsentMissing(f"{number} has not agreed to pictures yet")
+                raise ConsentMissing("this person has not agreed to pictures yet")
 
         return permit
 

@@ -4,9 +4,10 @@ An unreadable row affects only its own visit: lists omit the visit, `damaged` co
 StoreDamaged.
 """
 
+import json
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from typing import get_args
 
@@ -16,9 +17,11 @@ from sqlalchemy.orm import Session
 
 from device.values import ChannelUse
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import row_validation
+from services.records import patient_rows, row_validation
+from services.records.answers import IDENTIFIERS
 from services.records.capture import StoredVerdict
 from services.records.json_values import JsonValue
+from services.records.patient_index import index_of
 from services.records.programme import Programme
 from services.records.record_rows import visit_contents
 from services.records.record_signing import refuse_changed
@@ -30,7 +33,7 @@ from services.records.schema import (
     CaptureRow,
     CaptureSlotRow,
     ChangeRow,
-    IdentifierRow,
+    PatientRow,
     SlotDecisionRow,
     VisitRow,
     json_extract_or_null,
@@ -54,15 +57,15 @@ def visit_row(session: Session, id: str) -> VisitRow:
     return found
 
 
-def consent(session: Session, id: str) -> tuple[str, str | None]:
-    """Return the patient's number and the recorded answer of a visit to the consent question (None: no answer).
+def consent(session: Session, id: str) -> str | None:
+    """Return the recorded answer of a visit to the consent question (None: no answer).
 
     RecordNotFound if the visit is unknown, StoreDamaged if the answer cannot be read.
     """
-    patient = visit_row(session, id).patient
+    visit_row(session, id)
     value = answer(session, id, "consent")
     with reading_record(id):
-        return patient, None if value is None else row_validation.text(value)
+        return None if value is None else row_validation.text(value)
 
 
 def answer(session: Session, id: str, name: str) -> JsonValue:
@@ -84,13 +87,18 @@ def changes(session: Session, programme: Programme, row: VisitRow) -> list[Visit
                     "at": row_validation.timestamp(change.at),
                     "user": change.user,
                     "field": change.field,
-                    "was": row_validation.parsed_json(change.was),
-                    "value": row_validation.parsed_json(change.value),
+                    "was": _changed_value(session, row, change.field, change.was),
+                    "value": _changed_value(session, row, change.field, change.value),
                     "why": change.why,
                 }
             )
             for change in session.scalars(query)
         ]
+
+
+def _changed_value(session: Session, row: VisitRow, field: str, stored: object) -> JsonValue:
+    value = row_validation.parsed_json(stored)
+    return index_of(session).decrypted(row.patient, value) if field in IDENTIFIERS else value
 
 
 def find_rows(session: Session, limit: int, day: str | None, open: bool | None, number: str | None) -> list[VisitRow]:
@@ -106,7 +114,9 @@ def find_rows(session: Session, limit: int, day: str | None, open: bool | None, 
     if open is not None:
         query = query.where(VisitRow.finished_at.is_(None) if open else VisitRow.finished_at.is_not(None))
     if number:
-        query = query.where(func.instr(VisitRow.patient, number.upper()) > 0)
+        found = [id for id, known in index_of(session).numbers(session).items() if number.upper() in known]
+        ids = func.json_each(json.dumps(found)).table_valued("value")  # one parameter, however many there are
+        query = query.where(VisitRow.patient.in_(select(ids.c.value)))
     return [row for row in session.scalars(query) if row is not None]
 
 
@@ -131,13 +141,15 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
     known = without_damaged(rows, _checked_row)
     contents = visit_contents(session, known)
     ids = [row.id for row in known]
-    fields = _fields(session, known)
+    fields = _answers(session, ids)
+    index, identities = index_of(session), _identities(session, known)
     taken = _taken(session, ids)
     decided = _decided(session, ids)
 
     def visit(row: VisitRow) -> Visit:
         with reading_record(row.id):
             refuse_changed("visit", row, contents[row.id])
+            number, identifiers = index.identity(row.patient, identities[row.patient])
             slots = {
                 slot.id: SlotState(
                     tuple(_taken_capture(*columns) for columns in taken[row.id, slot.id]),
@@ -147,12 +159,13 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
             }
             finished_at = None if row.finished_at is None else row_validation.timestamp(row.finished_at)
             answers = {
-                row_validation.text(name): row_validation.form_value(row_validation.parsed_json(value))
-                for name, value in fields[row.id].items()
+                row_validation.text(name): row_validation.form_value(value)
+                for name, value in [*_parsed(fields[row.id]), *identifiers.items()]
             }
             return Visit(
                 row.id,
                 row.patient,
+                number,
                 _day(row.day),
                 row_validation.timestamp(row.begun_at),
                 answers,
@@ -165,9 +178,10 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
 
 
 def read_visit(session: Session, programme: Programme, row: VisitRow) -> Visit:
-    """Return the visit of this row; StoreDamaged if it cannot be read."""
+    """Return the visit of this row; RecordErased if its patient was erased, StoreDamaged if it cannot be read."""
     found = read_visits(session, programme, [row])
     if not found:
+        patient_rows.identity(session, _checked_row(row).patient)
         raise StoreDamaged(f"an entry of the visit {row.id!a} cannot be read", REMEDY)
     return found[0]
 
@@ -185,7 +199,7 @@ def damaged(session: Session, programme: Programme) -> int:
 
 
 def _checked_row(row: VisitRow) -> VisitRow:
-    """Return the row unchanged; StoreDamaged if its id is not that of a visit, or its patient number no text."""
+    """Return the row unchanged; StoreDamaged if its id is not that of a visit, or its patient id no text."""
     with reading_record(row.id):
         if not _ID.fullmatch(row_validation.text(row.id)):
             raise ValueError("no name of a visit")
@@ -205,18 +219,26 @@ def _outcome(value: object) -> Outcome:
     return Outcome(code, row_validation.text(stored["sentence"]))
 
 
-def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, str]]:
-    """Return the answers and identifying fields of each visit, as JSON texts, by visit id and field name."""
-    out: dict[str, dict[str, str]] = {row.id: {} for row in rows}
+def _answers(session: Session, ids: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return the answers of each visit, as JSON texts, by visit id and field name."""
+    out: dict[str, dict[str, str]] = {id: {} for id in ids}
     for field in session.scalars(select(AnswerRow).where(AnswerRow.visit.in_(out))):
         if field.visit in out:  # a damaged row may differ from the index
             out[field.visit][field.name] = field.value
-    known: dict[str, dict[str, str]] = defaultdict(dict)
-    for identifier in session.scalars(
-        select(IdentifierRow).where(IdentifierRow.patient.in_({row.patient for row in rows}))
-    ):
-        known[identifier.patient][identifier.name] = identifier.value
-    return {row.id: out[row.id] | known[row.patient] for row in rows}
+    return out
+
+
+def _parsed(fields: Mapping[str, str]) -> Iterator[tuple[str, JsonValue]]:
+    """Yield name and value of answers that are given as JSON texts."""
+    for name, value in fields.items():
+        yield name, row_validation.parsed_json(value)
+
+
+def _identities(session: Session, rows: Sequence[VisitRow]) -> dict[str, str]:
+    """Return the encrypted identity of the patient of each visit, by patient id."""
+    query = select(PatientRow.patient_id, PatientRow.identity)
+    found = session.execute(query.where(PatientRow.patient_id.in_({row.patient for row in rows})))
+    return {row.patient_id: row.identity for row in found}
 
 
 def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[object, ...]]]:

@@ -12,7 +12,7 @@ from services.errors import VisitFinished
 from services.records import answers, numbering, patient_rows, schema, visit_queries, visit_rows
 from services.records.idempotent_requests import IdempotentRequests
 from services.records.programme import Programme
-from services.records.schema import AnswerRow, IdentifierRow, VisitRow
+from services.records.schema import AnswerRow, VisitRow
 from services.records.storage_errors import storage_errors
 from services.records.visit import ReopenReason, Visit
 from services.records.visit_document import VisitChange
@@ -47,11 +47,11 @@ class VisitRepository:
             self.requests.delete_expired(session)
             prefix = self.programme.numbers.prefix
             begun_at = schema.utc_text(now)
-            number_of_patient = patient_rows.patient_number(session, prefix, number, begun_at)
+            patient = patient_rows.patient_of_number(session, prefix, number, begun_at)
             id = f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
             day = now.astimezone().date().isoformat()
             reference = self.requests.reference(key, request)
-            session.add(VisitRow(id=id, patient=number_of_patient, day=day, begun_at=begun_at, request=reference))
+            session.add(VisitRow(id=id, patient=patient, day=day, begun_at=begun_at, request=reference))
             return id
 
         return self.get(self.requests.run_in_transaction(key, request, act))
@@ -97,7 +97,7 @@ class VisitRepository:
         """Store the answer to the form field `name` of a visit; None is stored as no answer.
 
         `user` and the value before enter the history of the visit. Identifying fields belong to the patient, so all
-        visits of the patient show them; None deletes the field, and no history is kept.
+        visits of the patient show them; None deletes the field.
         Errors: InputError (unknown field, invalid answer), VisitFinished, RecordNotFound (unknown visit).
         """
         value = answers.validate_answer(name, value)
@@ -105,14 +105,12 @@ class VisitRepository:
         def act(session: Session) -> str:
             patient = visit_rows.unfinished_row(session, id).patient
             now = schema.utc_text(self.clock.wall())
-            if name not in answers.IDENTIFIERS:  # null is an answer too: no drops were given
+            if name in answers.IDENTIFIERS:
+                was = patient_rows.set_field(session, patient, name, value)
+            else:  # null is an answer too: no drops were given
                 was = visit_queries.answer(session, id, name)
-                visit_rows.record_change(session, id, name, was, value, now, user)
                 session.merge(AnswerRow(visit=id, name=name, value=json.dumps(value), set_at=now))
-            elif value is not None:
-                session.merge(IdentifierRow(patient=patient, name=name, value=json.dumps(value)))
-            elif (known := session.get(IdentifierRow, (patient, name))) is not None:
-                session.delete(known)
+            visit_rows.record_change(session, id, name, was, value, now, user)
             return id
 
         return self.get(self.requests.run_in_transaction(key, f"answer {id} {name} {json.dumps(value)}", act))
@@ -137,7 +135,7 @@ class VisitRepository:
         def act(session: Session) -> str:
             row = visit_queries.visit_row(session, id)
             if row.finished_at is not None and self._end_of_undo(datetime.fromisoformat(row.finished_at)) is None:
-                raise VisitFinished(f"{row.patient} was finished on an earlier day")
+                raise VisitFinished("this visit was finished on an earlier day")
             now = schema.utc_text(self.clock.wall())
             visit_rows.record_change(session, id, "outcome", visit_rows.outcome_code(row), None, now, user, reason)
             row.finished_at = row.outcome = None

@@ -7,7 +7,9 @@ from sqlalchemy.orm import Session
 
 from services.errors import VisitFinished
 from services.records import visit_queries
+from services.records.answers import IDENTIFIERS
 from services.records.json_values import FormValue, JsonValue
+from services.records.patient_index import index_of
 from services.records.programme import Programme
 from services.records.record_document import as_object
 from services.records.row_validation import parsed_json, reading_record
@@ -19,7 +21,7 @@ def unfinished_row(session: Session, id: str) -> VisitRow:
     """Return the row of an unfinished visit; VisitFinished if it is finished, RecordNotFound if unknown."""
     row = visit_queries.visit_row(session, id)
     if row.finished_at is not None:
-        raise VisitFinished(f"{row.patient} is finished")
+        raise VisitFinished("this visit is finished")
     return row
 
 
@@ -33,9 +35,15 @@ def record_change(
     user: str,
     why: str | None = None,
 ) -> None:
-    """Add one change of a visit at a time (UTC text) to its history; no effect if nothing changes."""
+    """Add one change of a visit at a time (UTC text) to its history; no effect if nothing changes.
+
+    Values of an identifying field are encrypted under the patient's key.
+    """
     if was == value:
         return
+    if field in IDENTIFIERS:
+        index, patient = index_of(session), visit_queries.visit_row(session, visit).patient
+        was, value = index.encrypted(patient, was), index.encrypted(patient, value)
     number = session.scalar(select(func.max(ChangeRow.number)).where(ChangeRow.visit == visit)) or 0
     values = {"was": json.dumps(was), "value": json.dumps(value)}
     session.add(ChangeRow(visit=visit, number=number + 1, at=at, user=user, field=field, why=why, **values))

@@ -26,6 +26,7 @@ from services.identity.users import ROLES, Role
 from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
+from services.records.patient_keys import ids_in_files
 from tests.golden import http_transcript
 from tests.journey.conftest import Rig, read_event_stream
 
@@ -428,6 +429,9 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
         ("", "refused", "", None, "400"),
     ]
     assert {one.more["clock"] for one in log.entries(100)} == {"not_set"}
+    patients = [one.more["patient"] for one in log.entries(100) if one.action in {"begin-visit", "answer"}]
+    assert len(patients) == 2
+    assert set(patients) <= ids_in_files(fresh.store.folder)[0]
     assert b"Meena" not in (tmp_path / "audit-log.jsonl").read_bytes()
     shown = ask(app, "GET", "/api/audit?action=sign-in", token).json()
     assert ([entry["number"] for entry in shown["entries"]], shown["problem"]) == ([2, 1], None)

@@ -87,10 +87,10 @@ def test_tables_are_copied_and_migrated_and_a_rolled_back_release_works_on_them(
     assert not (folder / "snapshots").exists()
     for _ in range(2):
         migrate(folder, migrations, clock)  # the update
-        assert [path.name for path in (folder / "snapshots").iterdir()] == ["s0002-20261121T000000.db"]
+        assert [path.name for path in (folder / "snapshots").iterdir()] == ["s0001-20261121T000000.db"]
         clock.sleep(1)
     run(folder, "UPDATE captures SET note = 'by the later release'")
-    assert version_of(folder / "snapshots" / "s0002-20261121T000000.db") == FIRST
+    assert version_of(folder / "snapshots" / "s0001-20261121T000000.db") == FIRST
     assert_complete(folder, [1])  # rolled back: this release reads and writes
     use(folder, 2)
     with CaptureStore(folder, reserve_bytes=0) as store:

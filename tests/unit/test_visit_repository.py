@@ -6,13 +6,16 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from sqlalchemy.orm import Session
 
 from device.clock import VirtualClock
 from device.errors import SpecError
-from services.errors import IdempotencyKeyConflict, RecordNotFound, VisitFinished
+from services.errors import IdempotencyKeyConflict, RecordErased, RecordNotFound, VisitFinished
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
 from services.records.programme import DEFAULT_PROGRAMME, load_programme
+from services.records.schema import VisitRow
+from services.records.upload_queue import UploadQueue
 from services.records.visit_repository import VisitRepository
 
 FILES = {"raw.tiff": b"raw" * 100, "report.json": b"{}"}
@@ -93,14 +96,59 @@ def test_a_capture_of_an_unknown_visit_is_not_stored(store: CaptureStore, people
         assert again.newly_quarantined == (), "nothing was written"
 
 
-def test_names_are_in_the_table_of_identifiers_only(store: CaptureStore, people: VisitRepository) -> None:
-    visit = people.begin(next(keys)).id
-    people.answer(next(keys), visit, "name", "Meenakshi")
-    with sqlite3.connect(store.folder / "store.sqlite") as connection:
-        names = [name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
-        rows = {name: repr(connection.execute(f"SELECT * FROM {name}").fetchall()) for name in names}
-    connection.close()
-    assert [name for name, held in rows.items() if "Meenakshi" in held] == ["identifiers"]
+PERSON = {"name": "Meenakshisundaram", "phone": "9840012345", "village": "Thiruppullani"}
+
+
+def test_no_file_of_the_store_holds_what_identifies_a_patient(store: CaptureStore, people: VisitRepository) -> None:
+    visit = people.begin(next(keys), "ZQ-77120").id
+    for name, value in (PERSON | {"consent": "agreed"}).items():
+        people.answer(next(keys), visit, name, value)
+    people.answer(next(keys), visit, "name", "Meenakshisundari")
+    shoot(store, people, visit, "R-centre", "a")
+    people.finish(next(keys), visit)
+    store.write_ahead_log.checkpoint_if_possible()
+    texts = ["ZQ-77120", "Meenakshisund", *PERSON.values()]
+    found = {
+        (str(path.relative_to(store.folder)), text)
+        for path in store.folder.rglob("*")
+        if path.is_file()
+        for text in texts
+        if text.encode() in path.read_bytes()
+    }
+    assert found == set()
+    shown = people.get(visit)
+    assert (shown.number, {name: shown.fields[name] for name in PERSON}) == (
+        "ZQ-77120",
+        PERSON | {"name": "Meenakshisundari"},
+    )
+    assert [(change.field, change.was, change.value) for change in people.changes(visit) if change.field in PERSON] == [
+        *((name, None, value) for name, value in PERSON.items()),
+        ("name", "Meenakshisundaram", "Meenakshisundari"),
+    ]
+
+
+def test_an_erased_patient_is_in_no_list_and_named_as_erased(store: CaptureStore, people: VisitRepository) -> None:
+    erased, other = people.begin(next(keys), "ZQ-1").id, people.begin(next(keys), "ZQ-2").id
+    people.finish(next(keys), erased)
+    with Session(store.engine) as session:
+        store.keys.erase(session.get_one(VisitRow, erased).patient)
+    assert [visit.id for visit in people.visits(10)] == [other]
+    assert [entry.visit for entry in UploadQueue(store.engine, people.clock).queued()] == []
+    with pytest.raises(RecordErased):
+        people.get(erased)
+    with pytest.raises(RecordErased):
+        people.changes(erased)
+
+
+def test_the_search_by_number_follows_changes_of_another_process(store: CaptureStore, people: VisitRepository) -> None:
+    first = people.begin(next(keys), "ZQ-100").id
+    assert [visit.id for visit in people.visits(10, number="q-1")] == [first]
+    with CaptureStore(store.folder, reserve_bytes=0) as other:
+        second = VisitRepository(other.engine, people.programme, people.clock).begin(next(keys), "ZQ-101").id
+        again = VisitRepository(other.engine, people.programme, people.clock).begin(next(keys), "ZQ-100").id
+    assert [visit.id for visit in people.visits(10, number="q-1")] == [again, second, first]
+    assert [visit.id for visit in people.visits(10, number="01")] == [second]
+    assert people.visits(10, number="5") == []
 
 
 def test_idempotency_keys_expire_after_a_month(store: CaptureStore, people: VisitRepository) -> None:
@@ -144,8 +192,8 @@ def test_an_invalid_protocol_is_refused_with_the_key_of_the_mistake(tmp_path: Pa
     "statement",
     [
         "INSERT INTO visits (id, patient, day, begun_at) VALUES ('v', 'no one', '2026-01-01', 'x')",
-        "INSERT INTO patients (number, made_at, patient_id) VALUES ('', 'x', 'id')",
-        "INSERT INTO patients (number, made_at, patient_id) VALUES ('123456789012345678901', 'x', 'id')",
+        "INSERT INTO patients (made_at, patient_id) VALUES ('x', 'id')",
+        "UPDATE patients SET identity = printf('%.*c', 10001, 'x')",
         "UPDATE visits SET finished_at = 'x'",
         "UPDATE visits SET outcome = '{}'",
         "DELETE FROM patients",

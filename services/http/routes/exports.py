@@ -45,7 +45,8 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
         copied = repository.requests.run_once(
             key, request, lambda: _copied(store, repository, visit, drives.mounted_folder(order.folder))
         )
-        return FolderName(folder=copied)
+        folder, name = copied.split("/")
+        return FolderName(folder=f"{folder}/{visit.number}-{name}")
 
     return router
 
@@ -57,8 +58,11 @@ def _listed(drive: UsbDrive) -> UsbDriveAnswer:
 
 
 def _copied(store: CaptureStore, repository: VisitRepository, visit: Visit, drive: Path) -> str:
-    """Copy a visit to a drive and record the export of a finished one; return the drive's name and the folder on it."""
+    """Copy a visit to a drive, and record the export of a finished one.
+
+    Return the drive's name and the folder on it without the patient number, since that is stored with the request.
+    """
     folder = copy_to_drive(drive, folder_name(visit), export_files(store, visit, repository.undo_until(visit)))
     if visit.finished_at is not None and store.refusal is None:
         ExportRecords(store.folder).write(visit.id, visit.finished_at, repository.clock.wall())
-    return f"{drive.name}/{folder.name}"
+    return f"{drive.name}/{folder.name.removeprefix(f'{visit.number}-')}"

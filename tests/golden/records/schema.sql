@@ -6,7 +6,7 @@ CREATE INDEX captures_to_sign ON captures (id) WHERE record_sha256 IS NULL;
 
 CREATE INDEX idempotency_keys_by_time ON idempotency_keys (done_at);
 
-CREATE INDEX patients_to_sign ON patients (number) WHERE record_sha256 IS NULL;
+CREATE INDEX patients_to_sign ON patients (patient_id) WHERE record_sha256 IS NULL;
 
 CREATE INDEX visits_by_day ON visits (day);
 
@@ -119,17 +119,6 @@ CREATE TABLE idempotency_keys (
 )
  STRICT;
 
-CREATE TABLE identifiers (
-	patient TEXT NOT NULL, 
-	name TEXT NOT NULL, 
-	value TEXT NOT NULL, 
-	PRIMARY KEY (patient, name), 
-	CONSTRAINT identifier_is_json CHECK (json_valid(value)), 
-	CONSTRAINT identifier_is_short CHECK (length(value) <= 2000), 
-	FOREIGN KEY(patient) REFERENCES patients (number)
-)
- STRICT;
-
 CREATE TABLE observed_time (
 	id INTEGER NOT NULL, 
 	boot TEXT NOT NULL, 
@@ -141,13 +130,13 @@ CREATE TABLE observed_time (
  STRICT;
 
 CREATE TABLE patients (
-	number TEXT NOT NULL, 
-	made_at TEXT NOT NULL, 
 	patient_id TEXT NOT NULL, 
+	made_at TEXT NOT NULL, 
+	identity TEXT NOT NULL, 
 	revision INTEGER DEFAULT '0' NOT NULL, 
 	record_sha256 TEXT, 
-	PRIMARY KEY (number), 
-	CONSTRAINT number_is_short CHECK (length(number) BETWEEN 1 AND 20)
+	PRIMARY KEY (patient_id), 
+	CONSTRAINT identity_is_short CHECK (length(identity) <= 10000)
 )
  STRICT;
 
@@ -195,7 +184,7 @@ CREATE TABLE visits (
 	PRIMARY KEY (id), 
 	CONSTRAINT finished_has_an_outcome CHECK ((finished_at IS NULL) = (outcome IS NULL)), 
 	CONSTRAINT outcome_is_json CHECK (outcome IS NULL OR json_valid(outcome)), 
-	FOREIGN KEY(patient) REFERENCES patients (number)
+	FOREIGN KEY(patient) REFERENCES patients (patient_id)
 )
  STRICT;
 
@@ -221,13 +210,7 @@ CREATE TRIGGER files_insert AFTER INSERT ON files BEGIN UPDATE captures SET reco
 
 CREATE TRIGGER files_update AFTER UPDATE ON files BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = NEW.capture_id; END;
 
-CREATE TRIGGER identifiers_delete AFTER DELETE ON identifiers BEGIN UPDATE patients SET record_sha256 = NULL WHERE number = OLD.patient; END;
-
-CREATE TRIGGER identifiers_insert AFTER INSERT ON identifiers BEGIN UPDATE patients SET record_sha256 = NULL WHERE number = NEW.patient; END;
-
-CREATE TRIGGER identifiers_update AFTER UPDATE ON identifiers BEGIN UPDATE patients SET record_sha256 = NULL WHERE number = NEW.patient; END;
-
-CREATE TRIGGER patients_changed AFTER UPDATE OF number, made_at, patient_id ON patients BEGIN UPDATE patients SET record_sha256 = NULL WHERE number = NEW.number; END;
+CREATE TRIGGER patients_changed AFTER UPDATE OF patient_id, made_at, identity ON patients BEGIN UPDATE patients SET record_sha256 = NULL WHERE patient_id = NEW.patient_id; END;
 
 CREATE TRIGGER slot_decisions_delete AFTER DELETE ON slot_decisions BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = OLD.visit; END;
 

@@ -12,16 +12,16 @@ down_revision = None
 branch_labels = None
 depends_on = None
 
-KEYS = {"captures": "id", "patients": "number", "visits": "id"}
+KEYS = {"captures": "id", "patients": "patient_id", "visits": "id"}
 VALUES = {
     "captures": "eye, taken_at, simulated, calibration_id, report, request",
-    "patients": "number, made_at, patient_id",
+    "patients": "patient_id, made_at, identity",
     "visits": "patient, day, begun_at, finished_at, outcome, sent, request",
 }
 PARTS = {  # table of values of a record: table of the record, column with the key of the record
     "files": ("captures", "capture_id"),
-    "identifiers": ("patients", "patient"),
     "answers": ("visits", "visit"),
+    "changes": ("visits", "visit"),
     "slot_decisions": ("visits", "visit"),
     "uploads": ("visits", "visit"),
 }
@@ -35,6 +35,7 @@ def upgrade() -> None:
     _create_doses()
     _create_patients()
     _create_visits()
+    _create_changes()
     _create_slots()
     _create_uploads()
     _create_requests()
@@ -108,20 +109,11 @@ def _create_doses() -> None:
 def _create_patients() -> None:
     op.create_table(
         "patients",
-        sa.Column("number", sa.Text, primary_key=True),
+        sa.Column("patient_id", sa.Text, primary_key=True),
         sa.Column("made_at", sa.Text, nullable=False),
-        sa.Column("patient_id", sa.Text, nullable=False),
+        sa.Column("identity", sa.Text, nullable=False),
         *_signing_columns(),
-        sa.CheckConstraint("length(number) BETWEEN 1 AND 20", name="number_is_short"),
-        sqlite_strict=True,
-    )
-    op.create_table(
-        "identifiers",
-        sa.Column("patient", sa.Text, sa.ForeignKey("patients.number"), primary_key=True),
-        sa.Column("name", sa.Text, primary_key=True),
-        sa.Column("value", sa.Text, nullable=False),
-        sa.CheckConstraint("json_valid(value)", name="identifier_is_json"),
-        sa.CheckConstraint("length(value) <= 2000", name="identifier_is_short"),
+        sa.CheckConstraint("length(identity) <= 10000", name="identity_is_short"),
         sqlite_strict=True,
     )
     op.create_table(
@@ -137,7 +129,7 @@ def _create_visits() -> None:
     op.create_table(
         "visits",
         sa.Column("id", sa.Text, primary_key=True),
-        sa.Column("patient", sa.Text, sa.ForeignKey("patients.number"), nullable=False),
+        sa.Column("patient", sa.Text, sa.ForeignKey("patients.patient_id"), nullable=False),
         sa.Column("day", sa.Text, nullable=False),
         sa.Column("begun_at", sa.Text, nullable=False),
         sa.Column("finished_at", sa.Text),
@@ -160,6 +152,22 @@ def _create_visits() -> None:
         sa.Column("set_at", sa.Text, nullable=False),
         sa.CheckConstraint("json_valid(value)", name="answer_is_json"),
         sa.CheckConstraint("length(value) <= 2000", name="answer_is_short"),
+        sqlite_strict=True,
+    )
+
+
+def _create_changes() -> None:
+    op.create_table(
+        "changes",
+        sa.Column("visit", sa.Text, sa.ForeignKey("visits.id"), primary_key=True),
+        sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
+        sa.Column("at", sa.Text, nullable=False),
+        sa.Column("user", sa.Text, nullable=False),
+        sa.Column("field", sa.Text, nullable=False),
+        sa.Column("was", sa.Text, nullable=False),
+        sa.Column("value", sa.Text, nullable=False),
+        sa.Column("why", sa.Text),
+        sa.CheckConstraint("json_valid(was) AND json_valid(value)", name="change_is_json"),
         sqlite_strict=True,
     )
 
