@@ -1,4 +1,4 @@
-"""Rows of patients: known or new patient by number, encrypted identity, counter of numbers, patient of a visit."""
+"""Rows of patients: by number or visit, the encrypted identity, and the counter of automatic numbers."""
 
 import secrets
 from collections.abc import Collection
