@@ -14,6 +14,7 @@ from typing import Any
 
 from device import atomic_io
 from device.clock import VirtualClock
+from services.identity.audit_key import load_or_create_audit_key
 from services.records import blobs, erasure, patient_keys
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
@@ -24,7 +25,6 @@ from services.records.programme import load_programme
 from services.records.removed_captures import Removal
 from services.records.visit_repository import VisitRepository
 
-KEY = bytes(range(32))
 CLOCK = VirtualClock()
 NUMBER, OTHER = "ZQ-77120", "ZQ-31415"
 PEOPLE: Mapping[str, Mapping[str, str]] = {
@@ -47,7 +47,7 @@ def plain_files(number: str, visit: int) -> dict[str, bytes]:
 
 def opened(folder: Path) -> CaptureStore:
     """Open a store that `filled` made, or make a new one."""
-    return CaptureStore(folder, reserve_bytes=0, key=KEY)
+    return CaptureStore(folder, reserve_bytes=0, key=load_or_create_audit_key(folder))
 
 
 def repository(store: CaptureStore) -> VisitRepository:

@@ -47,11 +47,11 @@ from services.records.schema import (
     VisitRow,
 )
 from services.records.storage_errors import storage_errors
+from services.records.visit import EraseReason
 
 log = logging.getLogger(__name__)
 
 LIST = "erasures.jsonl"
-EraseReason = Literal["withdrawn", "requested", "retention", "mistake"]
 
 
 class ErasureReceipt(BaseModel):

@@ -10,17 +10,21 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from device.errors import InputError
+from device.errors import InputError, StoreError
 from services.errors import RecordErased, RecordNotFound, StoreDamaged
+from services.identity.audit_key import read_audit_key
+from services.identity.erase_command import app
 from services.records import erasure, patient_keys
+from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal
 from services.records.capture_store import CaptureStore
 from services.records.erasure import ErasureReceipt
 from services.records.recovery_report import RecoveryReport
 from services.records.store_check import check_store
 from tests import erasures
-from tests.erasures import CLOCK, KEY, NUMBER, OTHER, PEOPLE, capture_id, filled, opened, plain_files, repository
+from tests.erasures import CLOCK, NUMBER, OTHER, PEOPLE, capture_id, filled, opened, plain_files, repository
 
 KILLS = 20
 
@@ -91,7 +95,7 @@ def test_no_file_has_anything_of_an_erased_patient_and_the_others_are_unchanged(
         assert shown(store, OTHER) == before
         assert store.recovery == RecoveryReport()
         assert [press.id for press in CaptureJournal(store).interrupted] == [capture_id(OTHER, 9)]
-    assert not any(result.damaged for result in check_store(folder, lambda _: None, KEY))
+    assert not any(result.damaged for result in check_store(folder, lambda _: None, read_audit_key(folder)))
 
 
 def _files_of(folder: Path, ids: list[str]) -> list[tuple[Path, bytes]]:
@@ -139,19 +143,19 @@ def test_a_line_that_another_program_wrote_erases_nobody(folder: Path) -> None:
 
 
 def test_a_receipt_names_nobody_and_a_changed_one_is_refused(folder: Path) -> None:
-    ids = ids_of(folder, NUMBER)
+    ids, key = ids_of(folder, NUMBER), read_audit_key(folder)
     receipt = erased(folder)
     content = receipt.model_dump_json().encode()
-    assert erasure.verified(content, KEY) == receipt
+    assert erasure.verified(content, key) == receipt
     assert (receipt.visits, receipt.captures, receipt.files) == (2, 2, 10)
     assert not [part for part in (*plain_parts(NUMBER), *(id.encode() for id in ids)) if part in content]
     changed = receipt.model_copy(update={"visits": 1}).model_dump_json().encode()
-    for forged, key in ((changed, KEY), (content, KEY[::-1]), (content, None)):
+    for forged, used in ((changed, key), (content, key[::-1]), (content, None)):
         with pytest.raises(StoreDamaged):
-            erasure.verified(forged, key)
+            erasure.verified(forged, used)
     for other in (b"{}", content[:-2], b"\xff"):
         with pytest.raises(InputError):
-            erasure.verified(other, KEY)
+            erasure.verified(other, key)
 
 
 def test_an_erasure_that_is_killed_at_any_point_is_finished_at_the_next_opening(original: Path, tmp_path: Path) -> None:
@@ -220,3 +224,23 @@ def test_an_erased_patient_is_erased_for_another_process_too(folder: Path) -> No
             repository(running).get(visit)
         with pytest.raises((RecordErased, RecordNotFound)):
             running.read(capture_id(NUMBER, 1), "picture.png")
+
+
+def test_the_command_erases_a_patient_and_verifies_the_receipt(folder: Path) -> None:
+    receipt = folder.parent / "receipt.json"
+    words = ["patient", NUMBER.lower(), "--data", str(folder), "--receipt", str(receipt)]
+    assert CliRunner().invoke(app, words, input="n\n").exit_code == 1
+    ids_of(folder, NUMBER)  # still there
+    with opened(folder), pytest.raises(StoreError, match="instrument is running"):
+        CliRunner().invoke(app, [*words, "--yes"], catch_exceptions=False)
+    assert CliRunner().invoke(app, [*words, "--reason", "none", "--yes"]).exit_code == 2
+    done = CliRunner().invoke(app, [*words, "--reason", "withdrawn", "--yes"], catch_exceptions=False)
+    assert "2 visits with 2 captures are erased" in done.stdout
+    assert hits(folder, plain_parts(NUMBER)) == []
+    (entry,) = AuditLog(folder, read_audit_key(folder), CLOCK).entries(10)
+    assert (entry.action, entry.more) == ("erase-patient", {"field": "withdrawn", "by": "command"})
+    check = ["verify", str(receipt), "--data", str(folder)]
+    assert "2 visits with 2 captures were erased" in CliRunner().invoke(app, check, catch_exceptions=False).stdout
+    receipt.write_text(receipt.read_text().replace("withdrawn", "mistake"))
+    with pytest.raises(StoreDamaged, match="receipt was changed"):
+        CliRunner().invoke(app, check, catch_exceptions=False)
