@@ -5,6 +5,7 @@ from typing import Annotated, cast, get_args
 
 import typer
 
+from device import atomic_io
 from device.clock import SystemClock
 from device.user_files import read_text
 from services.errors import RecordNotFound
@@ -21,7 +22,7 @@ Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 def patient(
     number: Annotated[str, typer.Argument(help="Number of the patient.")],
     data: Data,
-    receipt: Annotated[Path, typer.Option(help="File of the receipt, which names nobody.")],
+    receipt: Annotated[Path, typer.Option(help="File of the receipt, which has no name and no number.")],
     reason: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(EraseReason))}.")] = "requested",
     sure: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
@@ -36,6 +37,8 @@ def patient(
 
     if reason not in get_args(EraseReason):
         raise typer.BadParameter(f"{reason} is no reason; choose from {', '.join(get_args(EraseReason))}")
+    if receipt.exists() or not receipt.absolute().parent.is_dir():
+        raise typer.BadParameter(f"{receipt} cannot be a new file; choose another for the receipt")
     if not (data / "captures").is_dir():
         raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
     refuse_in_use(data / schema.DATABASE)
@@ -45,9 +48,8 @@ def patient(
         if not sure:
             typer.confirm(f"Erase {len(found.visits)} visits with {len(found.captures)} captures for good?", abort=True)
         with announcing("erasing"), storage_errors():
-            receipt.touch()  # before anything is erased
             _, written = store.erasures.erase(number, cast(EraseReason, reason), clock.wall())
-            receipt.write_text(written.model_dump_json(indent=1))
+            atomic_io.write_atomically(receipt, written.model_dump_json(indent=1).encode())
             AuditLog(data, key, clock).append("", "erase-patient", found.patient_id, field=reason, by="command")
     typer.echo(f"{written.visits} visits with {written.captures} captures are erased. The receipt is in {receipt}.")
     typer.echo("Make a backup to each stick and folder that has backups: that erases the patient there too.")

@@ -55,7 +55,7 @@ LIST = "erasures.jsonl"
 
 
 class ErasureReceipt(BaseModel):
-    """Receipt of an erasure, which names nobody: HMAC-SHA-256 of the patient id, UUID of the device, counts, time.
+    """Receipt of an erasure, without name and number: HMAC-SHA-256 of the patient id, UUID of the device, counts, time.
 
     `files`: number of files of the captures. `mac`: HMAC-SHA-256 of the other entries with the store's key.
     """

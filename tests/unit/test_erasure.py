@@ -117,7 +117,7 @@ def test_the_number_of_an_erased_patient_is_free_for_another_one(folder: Path) -
 def test_the_list_of_erasures_applies_to_a_restored_database_and_to_restored_keys(folder: Path, original: Path) -> None:
     erased(folder)
     listed = (folder / erasure.LIST).read_bytes()
-    for restore_list in (True, False):  # without the list, the erased key alone tells which rows are erased again
+    for restore_list in (True, False):  # without the list, the erased key alone shows which rows are erased again
         again = folder.with_name(f"again-{restore_list}")
         shutil.copytree(original, again)
         if restore_list:
@@ -130,7 +130,7 @@ def test_the_list_of_erasures_applies_to_a_restored_database_and_to_restored_key
         assert hits(again, [id.encode() for id in ids_of(original, NUMBER)[1:]]) == []
 
 
-def test_a_line_that_another_program_wrote_erases_nobody(folder: Path) -> None:
+def test_a_line_that_another_program_wrote_erases_no_patient(folder: Path) -> None:
     receipt = erased(folder)
     with opened(folder) as store:
         other = store.erasures.find(OTHER).patient_id
@@ -142,7 +142,7 @@ def test_a_line_that_another_program_wrote_erases_nobody(folder: Path) -> None:
         assert store.erasures.receipts() == [receipt]
 
 
-def test_a_receipt_names_nobody_and_a_changed_one_is_refused(folder: Path) -> None:
+def test_a_receipt_has_no_name_and_a_changed_one_is_refused(folder: Path) -> None:
     ids, key = ids_of(folder, NUMBER), read_audit_key(folder)
     receipt = erased(folder)
     content = receipt.model_dump_json().encode()
