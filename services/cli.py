@@ -40,6 +40,7 @@ GROUPS = {
     "programme": "services.records.programme_command",
     "users": "services.identity.users_command",
     "audit": "services.identity.audit_command",
+    "erase": "services.identity.erase_command",
 }
 
 

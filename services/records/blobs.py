@@ -10,14 +10,17 @@ a copy. The id is a random number, and is authenticated with the content.
 import errno
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from device import atomic_io
+from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records.patient_keys import PatientKeys
 
 _MAGIC = b"diffuscope "
+_MAX_HEADER = 64
 _PURPOSE = "file of a capture"  # its SHA-256 in the authenticated record binds it to its capture and name
 
 
@@ -58,6 +61,16 @@ def read_file(path: Path, keys: PatientKeys) -> bytes:
         return keys.decrypt(header.removeprefix(_MAGIC).decode("ascii", "replace"), content, _PURPOSE)
     except StoreDamaged as error:
         raise StoreDamaged(f"{path.name} of {path.parent.name} cannot be decrypted: {error.message}") from error
+
+
+def patient_of(folder: Path) -> str | None:
+    """Return the id of the patient under whose key the files in a folder are; None without an encrypted file."""
+    for path in files_in(folder):
+        with suppress(OSError), path.open("rb") as file:  # the other files of the folder name the same patient
+            header, _, _ = file.read(_MAX_HEADER).partition(b"\n")
+            if header.startswith(_MAGIC):
+                return header.removeprefix(_MAGIC).decode("ascii", "replace")
+    return None
 
 
 def write_folder(folder: Path, contents: Mapping[str, FileContent]) -> None:

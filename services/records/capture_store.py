@@ -16,6 +16,7 @@
     journal/                      captures in progress and their frames (capture_journal.py)
     dose-ledger.log               second copy of the dose ledger (dose_ledger_log.py)
     exports/<visit>.json          copies on USB drives (export_records.py)
+    erasures.jsonl                list of the erased patients (erasure.py)
     device.json                   identity of the device (device_identity.py)
     reserve.bin                   space for records on a full disk (reserve_file.py)
     replaced/                     what a restored backup replaced (restoration.py)
@@ -55,6 +56,7 @@ from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.capture_versions import CaptureVersions
 from services.records.earlier_stores import refuse_earlier_store
+from services.records.erasure import Erasures
 from services.records.patient_index import use_keys
 from services.records.patient_keys import PatientKeys
 from services.records.quarantine import Quarantine
@@ -84,7 +86,7 @@ class CaptureStore:
     restored from the files of the records. With `refusal` the folder is a copy in memory (read_only_store.py): nothing
     is recovered or quarantined, and every change raises this error. `key` authenticates the files of records and dose
     ledger: nothing is restored from one that another program wrote; None checks none. It also wraps `keys`, those of
-    the patients. `quarantine`, `versions`, `space` and `write_ahead_log` are the parts of the store for those matters.
+    the patients. `quarantine`, `versions`, `erasures`, `space` and `write_ahead_log` are its parts for those matters.
     Several threads may read while one writes; a lock file serialises writers across threads and processes. Opening and
     closing checkpoint the write-ahead log.
     Errors at opening: StoreError, StoreFull, StoreDamaged.
@@ -127,12 +129,14 @@ class CaptureStore:
                 self.keys = PatientKeys(folder, key)
                 use_keys(self.engine, self.keys)
                 self.versions = CaptureVersions(self._captures, self._lock, self.engine, self.keys)
+                self.erasures = Erasures(self.engine, self.keys, self._lock)
                 damage = self._set_damaged_database_aside()
                 schema.make_private(database)
                 schema.migrate(self.engine, snapshots.create)
                 if refusal is None:
                     self.recovery = Recovery(folder, self.engine, damage).run()
                     self.newly_quarantined = self.quarantine.move_incomplete()
+                    self.erasures.finish()
                     self.write_ahead_log.checkpoint_if_possible()
                     ReserveFile(folder).allocate_if_room(reserve_bytes, free_bytes(folder))
                 else:

@@ -37,7 +37,8 @@ class PatientKeys:
     """Keys of the patients of the store in `folder`, wrapped by the store's `key`; None: by a key that is public.
 
     Opening heals what is damaged in one copy, and makes the key of the device. Thread-safe; other processes may use the
-    same files. With `readonly` nothing is written: keys are only read. OSError if the disk refuses.
+    same files. With `readonly` nothing is written: keys are only read. `erased`: ids of the patients whose key this
+    process found or made erased. OSError if the disk refuses.
     """
 
     def __init__(self, folder: Path, key: bytes | None, readonly: bool = False) -> None:
@@ -45,6 +46,7 @@ class PatientKeys:
         self._wrapping = _wrapping(key)
         self._places = dict[str, int]()  # of the slots, by patient id; replaced as a whole
         self._size = 0  # of the files, in slots, when the places were read
+        self.erased = frozenset[str]()  # ids of the patients whose key was erased, when the places were read
         if readonly:
             self._read_places()
             return
@@ -76,6 +78,7 @@ class PatientKeys:
             self._read_places()
             if patient_id in self._places:
                 self._write(self._places[patient_id], _slot(patient_id, _ERASED))
+                self._read_places()
 
     def encrypt(self, patient_id: str, content: bytes, purpose: str) -> bytes:
         """Return a random nonce of 12 bytes and the encrypted content with its tag of 16 bytes.
@@ -125,6 +128,7 @@ class PatientKeys:
         slots = _merged(*map(_slots_of, self._paths))
         parsed = [None if slot is None else _parsed(slot) for slot in slots]
         self._places = {found[0]: place for place, found in enumerate(parsed) if found is not None}
+        self.erased = frozenset(found[0] for found in parsed if found is not None and found[1] == _ERASED)
         self._size = self._slots_in_files()
 
     def _write(self, place: int, slot: bytes) -> None:

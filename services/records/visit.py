@@ -14,6 +14,8 @@ GREEN_ONLY = "colour.none"  # no other colour was asked for, or the head has non
 EYE_WORDS = {"OD": "right", "OS": "left"}
 URGENT_COMPLAINTS = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
 ReopenReason = Literal["answer", "picture", "mistake"]  # a wrong answer, a missing picture, finished by mistake
+# consent withdrawn, erasure asked for, retention over, begun by mistake
+EraseReason = Literal["withdrawn", "requested", "retention", "mistake"]
 OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "declined", "send"]
 
 
