@@ -53,7 +53,7 @@ class AuditEntry:
 
 @dataclass(frozen=True)
 class AuditFinding:
-    """Result of a check: number of valid entries, and what is wrong; None if everything is as it was written."""
+    """Result of a check: number of valid entries among those checked, and what is wrong; None if all is as written."""
 
     entries: int
     problem: str | None
@@ -130,18 +130,19 @@ class AuditLog:
         number, mac = (0, "") if head is None else head[1]
         if newest_bytes is not None and size > newest_bytes and (first := next(lines, None)):
             number, mac = int(str(first["number"])), str(first["mac"])
+        begin = number
         for line in lines:
             if line is None:
-                return AuditFinding(number, f"the entry after number {number} cannot be read")
+                return AuditFinding(number - begin, f"the entry after number {number} cannot be read")
             if line.get("number") != number + 1 or not _is_authentic(self._key, mac, line):
-                return AuditFinding(number, f"the entry after number {number} was changed, moved or left out")
+                return AuditFinding(number - begin, f"the entry after number {number} was changed, moved or left out")
             number, mac = number + 1, str(line["mac"])
         if head is None:
-            return AuditFinding(number, "the head is missing or was changed")
+            return AuditFinding(number - begin, "the head is missing or was changed")
         # A power cut may come between an entry and its head.
         if head[0] != (number, mac) and head[0][0] != number - 1:
-            return AuditFinding(number, f"there are {number} entries, and there were {head[0][0]}")
-        return AuditFinding(number, None)
+            return AuditFinding(number - begin, f"there are {number} entries, and there were {head[0][0]}")
+        return AuditFinding(number - begin, None)
 
     def _position(self) -> tuple[int, str]:
         """Return number and `mac` after which the next entry is chained: of the last entry, or of a later head.

@@ -15,7 +15,7 @@ class AuditEntryAnswer(ResponseBody):
 
 
 class AuditAnswer(ResponseBody):
-    """Entries, the number of the last valid one, and what the check found; null if the entries are as written."""
+    """Entries, the number of valid ones in the part that was checked, and its problem; null without one."""
 
     entries: list[AuditEntryAnswer]
     count: int
