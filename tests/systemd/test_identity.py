@@ -17,7 +17,7 @@ from tests.systemd.machine import Machine, boot_tree, boot_until_power_cut, inst
 
 pytestmark = pytest.mark.systemd
 
-UNIT = "diffuscope-identity.service"
+UNIT, CERTIFICATE = "diffuscope-identity.service", "diffuscope-certificate.service"
 SHIPPED = {
     "fstab": "etc/fstab",
     "journald.conf": "etc/systemd/journald.conf.d/diffuscope.conf",
@@ -52,7 +52,10 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
     for name in ("captures", "compiled", "update", "journal"):
         (data / name).mkdir(parents=True)
     subprocess.run(["cp", "-al", root(), tree], check=True)
-    units = [(f"systemd/{UNIT}", f"etc/systemd/system/{UNIT}")]
+    units = [(f"systemd/{unit}", f"etc/systemd/system/{unit}") for unit in (UNIT, CERTIFICATE)]
+    units += [("systemd/diffuscope.sysusers", "etc/sysusers.d/diffuscope.conf")]
+    units += [("systemd/tls.tmpfiles", "etc/tmpfiles.d/diffuscope-tls.conf")]
+    units += [("systemd/image/address-change", "etc/NetworkManager/dispatcher.d/50-diffuscope")]
     for ours, theirs in [*units, *((f"systemd/image/{ours}", theirs) for ours, theirs in SHIPPED.items())]:
         words = [
             "install",
@@ -67,9 +70,11 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
     wants = tree / "etc/systemd/system/sysinit.target.wants"
     wants.mkdir(exist_ok=True)
     (wants / UNIT).symlink_to(f"/etc/systemd/system/{UNIT}")
-    own = tree / f"etc/systemd/system/{UNIT}.d/python.conf"  # the Python of the tests is outside Debian's library path
-    own.parent.mkdir()
-    own.write_text("[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n")
+    (tree / "etc/NetworkManager/dispatcher.d/50-diffuscope").chmod(0o755)
+    for unit in (UNIT, CERTIFICATE):  # the Python of the tests is outside Debian's library path
+        own = tree / f"etc/systemd/system/{unit}.d/python.conf"
+        own.parent.mkdir()
+        own.write_text("[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n")
     return Board(tree, data, [f"--bind={data}:/data", *installed(opt)])
 
 
@@ -131,3 +136,18 @@ def test_networkmanager_and_avahi_accept_their_configuration(board: Board) -> No
         log = machine.run("journalctl", "-u", "avahi-daemon", "-o", "cat")
         assert "Host name is diffuscope.local" in log
         assert "diffuscope.service) successfully established" in log
+
+
+def test_the_certificate_follows_an_address_and_only_its_group_reads_it(board: Board) -> None:
+    """The unit has no capability and no socket; the second address is set as DHCP would."""
+    with board.boots() as machine:
+        machine.run("systemctl", "start", CERTIFICATE)
+        server = "/run/diffuscope-tls/server.pem"
+        assert machine.run("stat", "-c", "%a %U %G", server).strip() == "640 root diffuscope-tls"
+        assert machine.run("stat", "-c", "%a", "/run/diffuscope-tls").strip() == "2750"
+        machine.run("ip", "link", "set", "lo", "up")
+        machine.run("ip", "address", "add", "192.168.77.5/32", "dev", "lo")
+        machine.run("/etc/NetworkManager/dispatcher.d/50-diffuscope", "lo", "up")
+        words = ["openssl", "x509", "-noout", "-ext", "subjectAltName", "-in", server]
+        machine.until(lambda: "192.168.77.5" in machine.run(*words))
+        assert "PRIVATE KEY" not in machine.run("cat", "/run/diffuscope-tls/authority.crt")
