@@ -31,8 +31,8 @@ from services.errors import RecordNotFound, StoreDamaged
 from services.records import blobs, digested_json, numbering, schema
 from services.records.device_identity import read_device
 from services.records.json_values import Timestamp
-from services.records.patient_index import index_of
 from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import index_of
 from services.records.reserve_file import ReserveFile
 from services.records.schema import (
     AnswerRow,
