@@ -26,10 +26,7 @@ def patient(
     reason: Annotated[str, typer.Option(help=f"One of {', '.join(get_args(EraseReason))}.")] = "requested",
     sure: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
-    """Erase all that is stored of a patient, for good; stop the instrument first.
-
-    Earlier backups hold it until the next backup to the same stick or folder.
-    """
+    """Erase all that is stored of a patient, for good; stop the instrument first, make new backups afterwards."""
     from services.records import schema  # deferred: imports SQLAlchemy
     from services.records.capture_store import CaptureStore
     from services.records.snapshots import refuse_in_use

@@ -14,15 +14,14 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from sqlalchemy import Engine, delete, func, select
-from sqlalchemy.orm import InstrumentedAttribute, Session
+from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.errors import InputError, StoreError
@@ -34,18 +33,7 @@ from services.records.json_values import Timestamp
 from services.records.patient_keys import PatientKeys
 from services.records.patient_rows import index_of
 from services.records.reserve_file import ReserveFile
-from services.records.schema import (
-    AnswerRow,
-    CaptureRow,
-    CaptureSlotRow,
-    ChangeRow,
-    FileRow,
-    IdempotencyKeyRow,
-    PatientRow,
-    SlotDecisionRow,
-    UploadRow,
-    VisitRow,
-)
+from services.records.schema import CaptureRow, FileRow, IdempotencyKeyRow, PatientRow, VisitRow
 from services.records.storage_errors import storage_errors
 from services.records.visit import EraseReason
 
@@ -62,7 +50,6 @@ class ErasureReceipt(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    format: Literal[1] = 1
     patient: str
     device: str
     erased_at: Timestamp
@@ -73,22 +60,17 @@ class ErasureReceipt(BaseModel):
     mac: str = ""
 
     def sealed(self, key: bytes | None) -> "ErasureReceipt":
-        """Return the receipt with the `mac` of its other entries."""
+        """Return the receipt with the `mac` of its other entries, which differs from its own if one was changed."""
         entries = json.dumps(self.model_dump(mode="json", exclude={"mac"}), sort_keys=True)
         return self.model_copy(update={"mac": _digest(key, "receipt", entries)})
 
-    def is_authentic(self, key: bytes | None) -> bool:
-        """Return whether the store with this key wrote the receipt, and all entries are as they were written."""
-        return hmac.compare_digest(self.sealed(key).mac.encode(), self.mac.encode())
 
-
-@dataclass(frozen=True)
-class PatientRecords:
+class PatientRecords(NamedTuple):
     """What is stored of a patient: ids of visits and captures, and the number of files of the captures."""
 
     patient_id: str
-    visits: tuple[str, ...]
-    captures: tuple[str, ...]
+    visits: Sequence[str]
+    captures: Sequence[str]
     files: int
 
 
@@ -101,9 +83,9 @@ class Erasures:
 
     def find(self, number: str) -> PatientRecords:
         """Return what is stored of the patient with a number; RecordNotFound without one, InputError if it is none."""
-        number = numbering.normalise(number)
+        wanted = numbering.normalise(number)
         with storage_errors(), Session(self._engine) as session:
-            found = next((id for id, known in index_of(session).numbers(session).items() if known == number), None)
+            found = next((id for id, known in index_of(session).numbers(session).items() if known == wanted), None)
             if found is None:
                 raise RecordNotFound("no patient has this number", "Type the number as the list of patients shows it.")
             return _records(session, found)
@@ -118,24 +100,14 @@ class Erasures:
         with storage_errors(), atomic_io.file_lock(self._lock):
             found = self.find(number)
             device = read_device(self._folder)
-            receipt = ErasureReceipt(
-                patient=_digest(self._key, "patient", found.patient_id),
-                device="" if device is None else device.uuid,
-                erased_at=at,
-                reason=reason,
-                visits=len(found.visits),
-                captures=len(found.captures),
-                files=found.files,
-            ).sealed(self._key)
-            ReserveFile(self._folder).retried(partial(_append, self._folder, {found.patient_id: receipt}))
+            counts = {"visits": len(found.visits), "captures": len(found.captures), "files": found.files}
+            patient, uuid = _digest(self._key, "patient", found.patient_id), "" if device is None else device.uuid
+            receipt = ErasureReceipt(patient=patient, device=uuid, erased_at=at, reason=reason, **counts)
+            receipt = receipt.sealed(self._key)
+            ReserveFile(self._folder).retried(partial(_append, self._folder, found.patient_id, receipt))
             self._keys.erase(found.patient_id)
             self._remove(found)
         return found.patient_id, receipt
-
-    def receipts(self) -> list[ErasureReceipt]:
-        """Return the receipts of all erasures, the newest first."""
-        with storage_errors():
-            return list(listed(self._folder, self._key).values())[::-1]
 
     def finish(self) -> None:
         """Erase again what a restoration brought back or an interruption left; the caller holds the lock."""
@@ -171,21 +143,18 @@ def listed(folder: Path, key: bytes | None) -> dict[str, ErasureReceipt]:
         with suppress(ValueError, KeyError, TypeError):
             entry = json.loads(line)
             patient_id, receipt = str(entry["patient_id"]), ErasureReceipt.model_validate(entry["receipt"])
-            if receipt.is_authentic(key) and receipt.patient == _digest(key, "patient", patient_id):
+            if receipt == receipt.sealed(key) and receipt.patient == _digest(key, "patient", patient_id):
                 receipts[patient_id] = receipt
     return receipts
 
 
 def carry_erasures(store: Path, key: bytes | None, restored: Path, restored_key: bytes | None) -> None:
     """Add the erasures of a store to the list of the restored files that will replace its own; OSError on failure."""
-    missing = {id: receipt for id, receipt in listed(store, key).items() if id not in listed(restored, restored_key)}
-    _append(
-        restored,
-        {
-            id: receipt.model_copy(update={"patient": _digest(restored_key, "patient", id)}).sealed(restored_key)
-            for id, receipt in missing.items()
-        },
-    )
+    known = listed(restored, restored_key)
+    for id, receipt in listed(store, key).items():
+        if id not in known:
+            patient = _digest(restored_key, "patient", id)
+            _append(restored, id, receipt.model_copy(update={"patient": patient}).sealed(restored_key))
 
 
 def verified(content: bytes, key: bytes | None) -> ErasureReceipt:
@@ -193,26 +162,20 @@ def verified(content: bytes, key: bytes | None) -> ErasureReceipt:
     try:
         receipt = ErasureReceipt.model_validate_json(content)
     except ValidationError as error:
-        raise InputError(
-            "this is no receipt of an erasure", "Give the file that was stored after the erasure."
-        ) from error
-    if not receipt.is_authentic(key):
+        raise InputError("this is no receipt of an erasure", "Give the file of a receipt.") from error
+    if receipt != receipt.sealed(key):
         raise StoreDamaged(
             "the receipt was changed, or another device wrote it", "Ask for the receipt as it was written."
         )
     return receipt
 
 
-def _append(folder: Path, receipts: dict[str, ErasureReceipt]) -> None:
-    """Add lines to the list, durable on return."""
-    lines = [
-        json.dumps({"patient_id": id, "receipt": receipt.model_dump(mode="json")}) for id, receipt in receipts.items()
-    ]
-    if not lines:
-        return
+def _append(folder: Path, patient_id: str, receipt: ErasureReceipt) -> None:
+    """Add a line to the list, durable on return."""
+    line = json.dumps({"patient_id": patient_id, "receipt": receipt.model_dump(mode="json")})
     with storage_errors():
         with open(folder / LIST, "ab", opener=atomic_io.private_opener) as file:
-            file.write("\n".join(["", *lines, ""]).encode())  # a torn line before stays a line of its own
+            file.write(f"\n{line}\n".encode())  # a torn line before it stays a line of its own
         atomic_io.fsync_file(folder / LIST)
         atomic_io.fsync_folder(folder)
 
@@ -225,7 +188,7 @@ def _records(session: Session, patient_id: str) -> PatientRecords:
     visits = session.scalars(select(VisitRow.id).where(VisitRow.patient == patient_id)).all()
     captures = session.scalars(select(CaptureRow.id).where(CaptureRow.visit.in_(visits))).all()
     files = session.scalar(select(func.count()).select_from(FileRow).where(FileRow.capture_id.in_(captures))) or 0
-    return PatientRecords(patient_id, tuple(visits), tuple(captures), files)
+    return PatientRecords(patient_id, visits, captures, files)
 
 
 def _paths(folder: Path, found: PatientRecords) -> Iterator[Path]:
@@ -251,22 +214,14 @@ def _visit_of(entry: Path) -> object:
 
 
 def _delete_rows(session: Session, found: PatientRecords) -> None:
-    visits, captures = found.visits, found.captures
-    columns: tuple[tuple[InstrumentedAttribute[str] | InstrumentedAttribute[str | None], Sequence[str]], ...] = (
-        (SlotDecisionRow.visit, visits),
-        (SlotDecisionRow.capture, captures),
-        (CaptureSlotRow.visit, visits),
-        (CaptureSlotRow.capture, captures),
-        (FileRow.capture_id, captures),
-        (CaptureRow.id, captures),
-        (UploadRow.visit, visits),
-        (AnswerRow.visit, visits),
-        (ChangeRow.visit, visits),
-        (VisitRow.id, visits),
-        (PatientRow.patient_id, [found.patient_id]),
-    )
-    for column, ids in columns:
-        session.execute(delete(column.class_).where(column.in_(ids)).execution_options(synchronize_session=False))
-    for id in (*visits, *captures):  # also in the answers of exports
-        answers = IdempotencyKeyRow.answer.contains(id, autoescape=True)
-        session.execute(delete(IdempotencyKeyRow).where(answers).execution_options(synchronize_session=False))
+    of_visits = (schema.SlotDecisionRow, schema.CaptureSlotRow, schema.UploadRow, schema.AnswerRow, schema.ChangeRow)
+    of_captures = (schema.SlotDecisionRow.capture, schema.CaptureSlotRow.capture, FileRow.capture_id, CaptureRow.id)
+    conditions = [
+        *(table.visit.in_(found.visits) for table in of_visits),
+        *(column.in_(found.captures) for column in of_captures),
+        *(IdempotencyKeyRow.answer.contains(id) for id in (*found.visits, *found.captures)),  # also of exports
+        VisitRow.id.in_(found.visits),
+        PatientRow.patient_id == found.patient_id,
+    ]
+    for condition in conditions:
+        session.execute(delete(condition.left.table).where(condition).execution_options(synchronize_session=False))
