@@ -112,10 +112,12 @@ def open_listeners(
             sockets = {name: undo.enter_context(bind_socket(host, number)) for name, number in ports.items()}
         elif not file.exists():  # the page of this computer is served all the same
             sockets = {PAGE_SOCKET: sockets[PAGE_SOCKET]}
-        for name, opened in sockets.items():
-            listener = Listener(opened, is_pairing=name == PAIRING_SOCKET)
+        for name in (PAGE_SOCKET, NETWORK_SOCKET, PAIRING_SOCKET):  # systemd passes them in any order
+            if name not in sockets:
+                continue
+            listener = Listener(sockets[name], is_pairing=name == PAIRING_SOCKET)
             if not listener.is_local and not listener.is_pairing:
-                listener = Listener(opened, file)
+                listener = Listener(sockets[name], file)
                 _check_certificate(file)
             if not listener.is_pairing or (tls / AUTHORITY).exists():
                 listeners.append(listener)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
 from tests.project_files import ROOT
 from tests.systemd.machine import Machine, boot_tree, boot_until_power_cut, installed, root
@@ -71,6 +72,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
     wants.mkdir(exist_ok=True)
     (wants / UNIT).symlink_to(f"/etc/systemd/system/{UNIT}")
     (tree / "etc/NetworkManager/dispatcher.d/50-diffuscope").chmod(0o755)
+    subprocess.run(["systemd-sysusers", f"--root={tree}"], check=True)
     for unit in (UNIT, CERTIFICATE):  # the Python of the tests is outside Debian's library path
         own = tree / f"etc/systemd/system/{unit}.d/python.conf"
         own.parent.mkdir()
@@ -138,6 +140,13 @@ def test_networkmanager_and_avahi_accept_their_configuration(board: Board) -> No
         assert "diffuscope.service) successfully established" in log
 
 
+def addresses(pem: str) -> set[str]:
+    """Return the addresses that a certificate names."""
+    certificate = x509.load_pem_x509_certificate(pem.encode())
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    return {str(address) for address in names.get_values_for_type(x509.IPAddress)}
+
+
 def test_the_certificate_follows_an_address_and_only_its_group_reads_it(board: Board) -> None:
     """The unit has no capability and no socket; the second address is set as DHCP would."""
     with board.boots() as machine:
@@ -145,9 +154,7 @@ def test_the_certificate_follows_an_address_and_only_its_group_reads_it(board: B
         server = "/run/diffuscope-tls/server.pem"
         assert machine.run("stat", "-c", "%a %U %G", server).strip() == "640 root diffuscope-tls"
         assert machine.run("stat", "-c", "%a", "/run/diffuscope-tls").strip() == "2750"
-        machine.run("ip", "link", "set", "lo", "up")
-        machine.run("ip", "address", "add", "192.168.77.5/32", "dev", "lo")
-        machine.run("/etc/NetworkManager/dispatcher.d/50-diffuscope", "lo", "up")
-        words = ["openssl", "x509", "-noout", "-ext", "subjectAltName", "-in", server]
-        machine.until(lambda: "192.168.77.5" in machine.run(*words))
+        words = ["connection", "add", "type", "dummy", "ifname", "cable", "ip4", "192.168.77.5/24"]
+        machine.run("nmcli", *words)  # NetworkManager calls address-change
+        machine.until(lambda: "192.168.77.5" in addresses(machine.run("cat", server)))
         assert "PRIVATE KEY" not in machine.run("cat", "/run/diffuscope-tls/authority.crt")
