@@ -48,7 +48,7 @@ class PatientIndex:
             return row_validation.text(values[NUMBER]), fields
 
     def numbers(self, session: Session) -> dict[str, str]:
-        """Return the readable numbers by patient id; only identities that are new, of any process, are decrypted."""
+        """Return the readable numbers by patient id; only new identities are decrypted, of any process."""
         rows = session.execute(select(PatientRow.patient_id, PatientRow.identity)).all()
         return {id: number for id, identity in rows if (number := self._number(id, identity)) is not None}
 
@@ -59,7 +59,7 @@ class PatientIndex:
 
 
 def index_of(session: Session) -> PatientIndex:
-    """Return the index of the store whose tables a session reads, which `CaptureStore` gives to its engine."""
+    """Return the index that `CaptureStore` gives to the engine of its tables."""
     index: PatientIndex = session.get_bind().get_execution_options()["patients"]
     return index
 
