@@ -1,10 +1,12 @@
 """Server certificate of the device for its present addresses, renewed in the folder from which the server reads it.
 
 `systemd/diffuscope-certificate.service` runs this module as root at each change of an address and once a day: the
-server has no access to the key of the authority, and none to the network's addresses.
+server has no access to the key of the authority, and none to the network's addresses. The first run of a boot shows a
+set-up code on the console.
 """
 
 import sys
+from math import inf
 from pathlib import Path
 
 from device import atomic_io
@@ -12,6 +14,7 @@ from device.clock import Clock, SystemClock
 from services.identity.apply_at_boot import Computer
 from services.identity.certificates import check_validity, create_server_certificate, present_addresses
 from services.identity.provision import Identity, load_or_create_identity
+from services.identity.setup_code import SetupCode
 
 SERVER, AUTHORITY, UNCONSTRAINED = "server.pem", "authority.crt", "authority-unconstrained.crt"
 OUTPUT = "run/diffuscope-tls"  # of the device
@@ -49,3 +52,6 @@ if __name__ == "__main__":
     stored = computer.data / "identity"
     identity = load_or_create_identity(stored, computer.serial(), SystemClock())
     sys.stderr.write(renew_certificate(identity, stored, computer.root / OUTPUT, SystemClock()))
+    code = SetupCode(computer.root / OUTPUT, SystemClock())
+    if not code.is_of_this_boot:
+        computer.show_setup_code(code.create(inf))

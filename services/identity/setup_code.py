@@ -1,4 +1,7 @@
-"""Set-up code of a label: it lets the first administrator be created, for two minutes and five tries."""
+"""Set-up code of a label: it lets the first administrator be created, for two minutes and five tries.
+
+That of the device's own console is valid until the next boot or label, as a card without SSH prints no other.
+"""
 
 import secrets
 from pathlib import Path
@@ -19,11 +22,16 @@ class SetupCode:
         self._file, self._clock = folder / FILE, clock
         self._tried, self._tries = "", 0
 
-    def create(self) -> str:
-        """Return a new code, which replaces an earlier one."""
+    @property
+    def is_of_this_boot(self) -> bool:
+        """Whether a code was created since the last boot."""
+        return self._file.exists() and self._file.read_text().split()[1] == boot_id()
+
+    def create(self, valid_s: float = VALID_S) -> str:
+        """Return a new code, valid for this time, which replaces an earlier one."""
         code = "".join(secrets.choice(LETTERS) for _ in range(LENGTH))
         atomic_io.make_folder(self._file.parent)
-        content = f"{code} {boot_id()} {self._clock.now_s()}".encode()
+        content = f"{code} {boot_id()} {self._clock.now_s() + valid_s}".encode()
         atomic_io.write_atomically(self._file, content, GROUP_READABLE)
         return code
 
@@ -32,8 +40,8 @@ class SetupCode:
         content = self._file.read_text() if self._file.exists() else ""
         if content != self._tried:
             self._tried, self._tries = content, 0
-        code, boot, created_s = content.split() if content else ("", "", "0")
-        is_open = boot == boot_id() and self._clock.now_s() - float(created_s) < VALID_S and self._tries < MAX_TRIES
+        code, boot, until_s = content.split() if content else ("", "", "0")
+        is_open = boot == boot_id() and self._clock.now_s() < float(until_s) and self._tries < MAX_TRIES
         letters = "".join(letter for letter in typed.upper() if letter.isalnum())
         if is_open and secrets.compare_digest(letters.encode(), code.encode()):
             return True

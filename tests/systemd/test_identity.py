@@ -154,6 +154,8 @@ def test_the_certificate_follows_an_address_and_only_its_group_reads_it(board: B
         server = "/run/diffuscope-tls/server.pem"
         assert machine.run("stat", "-c", "%a %U %G", server).strip() == "640 root diffuscope-tls"
         assert machine.run("stat", "-c", "%a", "/run/diffuscope-tls").strip() == "2750"
+        console = machine.run("cat", "/run/issue.d/diffuscope-setup.issue")
+        assert console.split()[-1].replace("-", "") == machine.run("cat", "/run/diffuscope-tls/setup-code").split()[0]
         words = ["connection", "add", "type", "dummy", "ifname", "cable", "ip4", "192.168.77.5/24"]
         machine.run("nmcli", *words)  # NetworkManager calls address-change
         machine.until(lambda: "192.168.77.5" in addresses(machine.run("cat", server)))

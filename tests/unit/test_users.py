@@ -1,6 +1,7 @@
 """Table of the users, set-up code, lock-out and logins. Time is virtual."""
 
 import stat
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -126,8 +127,20 @@ def test_a_set_up_code_ends_with_the_fifth_wrong_try_and_with_the_boot(tmp_path:
     assert not codes.is_valid("BBBBBBBB")
     assert not codes.is_valid(code)
     assert codes.is_valid(codes.create())
-    (tmp_path / "setup-code").write_text(f"{code} another-boot {clock.now_s()}")
+    (tmp_path / "setup-code").write_text(f"{code} another-boot {clock.now_s() + 60}")
+    assert not codes.is_of_this_boot
     assert not codes.is_valid(code)
+
+
+def test_the_code_of_the_console_is_valid_until_a_label_replaces_it(tmp_path: Path, clock: VirtualClock) -> None:
+    codes = SetupCode(tmp_path, clock)
+    assert not codes.is_of_this_boot
+    of_console = codes.create(inf)
+    clock.sleep(86_400.0)
+    assert codes.is_of_this_boot
+    assert codes.is_valid(of_console)
+    codes.create()
+    assert not codes.is_valid(of_console)
 
 
 def test_each_wrong_attempt_doubles_the_wait_of_account_and_address(tmp_path: Path, clock: VirtualClock) -> None:
