@@ -105,14 +105,22 @@ class Disk(DiskStub):
 
 
 class RecordedRequests:
-    """ASGI application that counts the captures which pages requested."""
+    """ASGI application that counts the captures which pages requested.
+
+    One from outside the page gets the key of the last page, which holds the control lease.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app, self.presses = app, 0
+        self._page_key: list[tuple[bytes, bytes]] = []
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and (scope["method"], scope["path"]) == PAGE_PRESS:
-            self.presses += any(name == b"x-controller" for name, _ in scope["headers"])
+        if scope["type"] == "http":
+            key = [header for header in scope["headers"] if header[0] == b"x-controller"]
+            self._page_key = key or self._page_key
+            if (scope["method"], scope["path"]) == PAGE_PRESS:
+                self.presses += bool(key)
+                scope["headers"] = [*scope["headers"], *([] if key else self._page_key)]
         await self.app(scope, receive, send)
 
 

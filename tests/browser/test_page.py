@@ -156,7 +156,8 @@ def test_press_during_other_captures_shows_busy_alert(page: Page, complaints: Co
     wait_for_preview(page)
     # A client that requests a capture every 50 ms keeps both places in the queue taken for seconds.
     page.evaluate("""() => {
-        const headers = { "Content-Type": "application/json" };
+        const controller = sessionStorage.getItem("diffuscope.controller"); // the page holds the control lease
+        const headers = { "Content-Type": "application/json", "X-Controller": controller };
         let left = 40;
         const again = setInterval(() => {
             const key = (left + 256).toString(16).padStart(16, "0");
