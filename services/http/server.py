@@ -39,6 +39,7 @@ from services.http.connection_limits import ConnectionLimits, ConnectionTable, L
 from services.http.log_rate import LOGGER_NAMES, LogRateLimit
 from services.http.routes.accuracy import accuracy_routes
 from services.http.routes.backup import backup_routes
+from services.http.routes.erasure import erasure_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
@@ -180,6 +181,7 @@ def serve(
             update_routes(UpdateRequests(*updater, clock, version("diffuscope"))),
             event_log_routes(event_log, UsbDrives(), clock),
             backup_routes(backups, store, UsbDrives(), clock),
+            erasure_routes(arbiter, backups),
         ]
         authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, address), store.refusal)
         app = create_app(
