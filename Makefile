@@ -115,7 +115,7 @@ INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibr
 # Minutes each: 1,250 damages, of which `make test` has a sample; pictures, layouts and a calibration of lenslets; the maker's chart; hard frames
 # of several eyes, of which `make test-faults` has the grid; montages; guided calibrations, updates, hasty fingers and every
 # alert in every language on the page, whose server side `make test-faults` tries; what moves on the page in every size.
-LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_full_field.py hard/test_quality.py hard/test_background.py hard/test_flicker.py \
+LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_edits.py journey/test_roles.py hard/test_full_field.py hard/test_quality.py hard/test_background.py hard/test_flicker.py \
 	hard/test_far_eyes.py hard/test_ghost.py hard/test_cut_pupils.py hard/test_spots.py hard/test_dark_border.py hard/test_uneven_light.py hard/test_sensor_lines.py \
 	hard/test_given_field.py physics/test_lenslets.py physics/test_lens_design.py physics/test_lens_pictures.py \
 	physics/test_independent_lens_frames.py \
@@ -254,11 +254,16 @@ lint: .venv/ready .venv/typescript/ready ## Check style, types (Python and the p
 VERSION = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 
 # The version is written, not computed from tags (services/decisions/0004-version-in-pyproject.md); the tag must equal it.
-release: lint ## Check version, changelog and citation, build wheel and source archive into dist, tag this commit.
+# --strict: a package that the database of PyPI does not answer for is a failure. Not part of CI, which needs no network for
+# its result: an advisory of today would fail the commit of yesterday.
+AUDIT := pip-audit==2.10.1 --strict --require-hashes --disable-pip
+
+release: lint ## Check version, changelog, citation and known vulnerabilities of what the locks name, build wheel and source archive into dist, tag this commit.
 	@[ -z "$$(git status --porcelain)" ] || { echo "Commit the changes first: a release is one commit"; exit 1; }
 	@! sed -n '/^## Unreleased/,/^## [0-9]/p' CHANGELOG.md | grep -q '^\*' || \
 		{ echo "Move the lines under Unreleased in CHANGELOG.md to a section with version and date"; exit 1; }
 	@$(BIN)/python -m pytest -q tests/test_publication.py
+	@$(UV) tool run --quiet $(AUDIT) -r requirements.lock -r systemd/image/requirements.lock
 	@git rev-parse -q --verify "refs/tags/v$(VERSION)" >/dev/null || git tag -a "v$(VERSION)" -m "Diffuscope $(VERSION)"
 	@[ "$$(git rev-parse "v$(VERSION)^{commit}")" = "$$(git rev-parse HEAD)" ] || \
 		{ echo "v$(VERSION) is another commit: raise the version in pyproject.toml, CITATION.cff and CHANGELOG.md"; exit 1; }

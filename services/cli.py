@@ -104,13 +104,17 @@ def run(
     raw: Annotated[list[Path] | None, typer.Option(help="Raw frames of a recording, with --psf.")] = None,
     psf: Annotated[list[Path] | None, typer.Option(help="PSF of a recording; several, or a folder: a stack.")] = None,
     host: Annotated[
-        str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network, with users and --certificate.")
+        str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network, after `diffuscope label`.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
-    certificate: Annotated[
-        Path | None, typer.Option(help="Certificate of TLS with its chain, as PEM; needed beyond this computer.")
+    tls: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of server.pem, the certificate beyond this computer; by default `tls` of --data.",
+            readable=False,
+        ),
     ] = None,
-    certificate_key: Annotated[Path | None, typer.Option(help="Private key of the certificate, as PEM.")] = None,
+    pairing_port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the pairing page; 0: none.")] = 0,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
     programme: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
     name: Annotated[list[str] | None, typer.Option(help="A further name of this computer, or of a proxy.")] = None,
@@ -124,7 +128,7 @@ def run(
 ) -> None:
     """Serve the page: one button, one true picture."""
     from services.delivery.uploader import HttpsUploader, load_settings
-    from services.http.server import Certificate, base_url, bind_socket, inherited_socket, serve  # web stack: here only
+    from services.http.server import base_url, open_listeners, serve  # web stack: here only
     from services.instrument.watchdog import Watchdog
     from services.records.programme import DEFAULT_PROGRAMME, load_programme
     from services.research.frontier import measure_scene
@@ -133,22 +137,21 @@ def run(
     plan = load_programme(programme or DEFAULT_PROGRAMME)
     uploader = HttpsUploader(load_settings(send)) if send is not None else None
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
-    address = inherited_socket(os.environ) or bind_socket(host, port)
-    served, at = address.getsockname()[:2]
     folder = data or _default_data()
-    if (certificate is None) != (certificate_key is None):
-        raise typer.BadParameter("--certificate and --certificate-key belong together: give both, or none")
-    tls = Certificate(certificate, certificate_key) if certificate is not None and certificate_key is not None else None
+    tls = tls or folder / "tls"
+    listeners = open_listeners(os.environ, host, port, tls, pairing_port)
+    served, at = listeners[0].socket.getsockname()[:2]
 
     def ready(needs_setup: bool) -> None:
-        typer.echo(f"Open {base_url(served, at, tls is not None)} in a browser")
+        typer.echo(f"Open {base_url(served, at, listeners[0].certificate is not None)} in a browser")
         if needs_setup:
-            typer.echo(f"It asks for the set-up code, which `diffuscope users list --data {folder}` prints")
+            typer.echo(f"It asks for the set-up code, which `diffuscope label --data {folder}` prints")
 
     serve(
         spec,
-        address,
+        listeners,
         folder,
+        tls,
         ready,
         Watchdog(os.environ.get("NOTIFY_SOCKET")),
         plan,
@@ -156,8 +159,27 @@ def run(
         tuple(name or ()),
         (updates, update_requests),
         uploader,
-        tls,
     )
+
+
+@app.command()
+@announced("making the label")
+def label(
+    data: Annotated[Path | None, typer.Option(help="Data folder; by default that of the device.")] = None,
+    pairing_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the pairing page.")] = 80,
+) -> None:
+    """Print how a tablet is paired with this device: address, QR code, fingerprint, and the code of a new device."""
+    from services.identity.apply_at_boot import Computer
+    from services.identity.label import pairing_label
+    from services.identity.renewal import OUTPUT
+
+    computer = Computer()
+    folder = data or _default_data()
+    folders = folder, folder / "identity", folder / "tls"
+    if data is None and (computer.root / OUTPUT).exists():  # the units of systemd/ are installed
+        stored = computer.data if computer.data.exists() else Path("/etc/diffuscope")
+        folders = Path("/var/lib/diffuscope"), stored / "identity", computer.root / OUTPUT
+    typer.echo(pairing_label(*folders, pairing_port, SystemClock()))
 
 
 def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs: tuple[Path, ...]) -> InstrumentSpec:

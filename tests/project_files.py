@@ -1,6 +1,7 @@
 """Files of the repository for the architecture tests: names, texts, syntax trees, and the check of a rule."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -32,10 +33,11 @@ Finder = Callable[[str], Iterable[Violation]]
 
 @cache
 def files() -> tuple[str, ...]:
-    """Return the tracked and the untracked, not ignored files, without vendored code."""
+    """Return the tracked and the untracked, not ignored files, without vendored code and encrypted golden files."""
     git = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(git, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
-    return tuple(sorted(n for n in names if not n.startswith("web/vendor/") and (ROOT / n).is_file()))
+    others = re.compile("web/vendor/|.*/kept/data/")
+    return tuple(sorted(n for n in names if not others.match(n) and (ROOT / n).is_file()))
 
 
 @cache

@@ -27,6 +27,7 @@ from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG
 from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.patient_keys import FILES as KEYS
 from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue, UploadReceipt
@@ -55,13 +56,13 @@ class Shown:
     settings: Mapping[str, str] = field(default_factory=dict)
 
 
-def filled_store(folder: Path, *, with_log: bool) -> Path:
+def filled_store(folder: Path, *, with_log: bool, key: bytes | None = None) -> Path:
     """Make a store with visits, captures, a correction of an eye, an upload and doses; return its folder.
 
-    `with_log`: copy it while it is open, so that its last rows are in the write-ahead log only.
+    `with_log`: copy it while it is open, so that its last rows are in the write-ahead log only. `key`: of the store.
     """
     keys, clock, original = (f"{number:016x}" for number in count()), VirtualClock(), folder / "original"
-    with CaptureStore(original, reserve_bytes=0) as store:
+    with CaptureStore(original, reserve_bytes=0, key=key) as store:
         people = VisitRepository(store.engine, load_programme(), clock)
         light = DoseLedgerStore(store.engine, clock, WINDOW_S, "boot")
         for number in range(VISITS):
@@ -96,13 +97,13 @@ def filled_store(folder: Path, *, with_log: bool) -> Path:
     return original
 
 
-def shown(folder: Path, with_settings: bool = False) -> tuple[Shown, int]:
+def shown(folder: Path, with_settings: bool = False, key: bytes | None = None) -> tuple[Shown, int]:
     """Open a store as the program does; return what it shows, and the number of records reported as damaged.
 
     `with_settings`: also the journal, the calibration, the login and the key of the backups.
     """
     clock = VirtualClock(elapsed_s=100.0)
-    with CaptureStore(folder, reserve_bytes=0) as store:
+    with CaptureStore(folder, reserve_bytes=0, key=key) as store:
         people = VisitRepository(store.engine, load_programme(), clock)
         light = DoseLedgerStore(store.engine, clock, WINDOW_S, "boot")
         journal = CaptureJournal(store).interrupted
@@ -163,13 +164,13 @@ def expected(store: Path, with_settings: bool = False) -> Shown:
     return before
 
 
-def judge(folder: Path, before: Shown, with_settings: bool) -> tuple[Outcome, list[str]]:
+def judge(folder: Path, before: Shown, with_settings: bool, key: bytes | None = None) -> tuple[Outcome, list[str]]:
     """Return the outcome of opening a damaged store, and its violations; `with_settings` as in `shown`.
 
     A violation is a silent loss, a silent change of what is shown, a lower dose, or an exception.
     """
     try:
-        after, reported = shown(folder, with_settings)
+        after, reported = shown(folder, with_settings, key)
     except (DiffuscopeError, SQLAlchemyError, sqlite3.Error, OSError, ValueError, TypeError, KeyError) as error:
         return "reported", [f"failed start: {type(error).__name__}: {error}"]
     violations = []
@@ -269,7 +270,7 @@ def targets(folder: Path, which: str) -> list[Path]:
     of_records = [path for path in every if path.relative_to(folder).parts[0] in RECORD_FOLDERS]
     if which == "files":
         return of_records
-    others = {"calibrations", "journal", "access", KEY_FILE}
+    others = {"calibrations", "journal", "access", KEY_FILE, *KEYS}
     return [path for path in every if path.relative_to(folder).parts[0] in others]
 
 

@@ -15,7 +15,7 @@ import yaml
 
 from device.config.head_file import load_head
 from services.identity.apply_settings import OUTPUT
-from services.identity.certificates import ACCESS_POINT_ADDRESS, NETWORKS, SHARED_HOST_NAME
+from services.identity.certificates import ACCESS_POINT_ADDRESS, SHARED_HOST_NAME
 from tests.project_files import ROOT, text
 
 CARD = "systemd/image/card"
@@ -180,7 +180,7 @@ def test_access_point_is_off_and_has_no_shared_password() -> None:
     assert profile["wifi"]["ssid"] == "@NAME@"
     assert profile["wifi-security"]["key-mgmt"] == "wpa-psk"
     assert profile["connection"]["autoconnect"] == "false", "the page has no sign-in yet"
-    assert profile["ipv4"]["address1"] == f"{ACCESS_POINT_ADDRESS}/{NETWORKS[0].prefixlen}"
+    assert profile["ipv4"]["address1"] == f"{ACCESS_POINT_ADDRESS}/24"
 
 
 def test_country_of_the_settings_is_set_when_the_radio_appears() -> None:
@@ -234,5 +234,8 @@ def test_every_file_beside_the_recipe_is_installed() -> None:
         "diffuscope-update.timer",
         "diffuscope-update-request.path",
         "diffuscope-clock.path",
+        "diffuscope-certificate.timer",
+        "diffuscope-network.socket",
+        "diffuscope-pairing.socket",
     }
     assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

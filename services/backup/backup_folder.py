@@ -1,4 +1,4 @@
-"""Folder of the backups of one device on a stick or path: encrypted objects that are written once.
+"""Folder of the backups of one device on a stick or path: encrypted objects that are written once, and keys.
 
     diffuscope-backup-<id>/
         README.txt              how to restore
@@ -6,7 +6,9 @@
         objects/<sha256>.age    one folder of the store (a capture), as an encrypted tar archive
         index.txt               append-only: name of each backed-up content, its object, and a seal (backup_key.py)
         backups/<number>.age    one backup: everything else in the store, and the list of its objects
+        patient-keys.age        keys of the patients, replaced by each backup; patient-keys-copy.age is the same
 
+The keys are overwritten in place: an erased patient is erased in all backups.
 An object is named by the SHA-256 of its encrypted content, so that a copy can be checked without a key. A line of the
 index is written after its object is durable, a backup after all of its objects: a backup that was interrupted leaves
 the earlier ones complete, and the next one continues.
@@ -24,6 +26,7 @@ from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
 
 PREFIX = "diffuscope-backup-"
+PATIENT_KEYS = ("patient-keys.age", "patient-keys-copy.age")
 _LINE = re.compile(r"([0-9a-f]{64}) ([0-9a-f]{64}) ([0-9]+) [0-9a-f]{64}")
 README = """Backups of one Diffuscope device, encrypted with age (https://age-encryption.org).
 
@@ -94,6 +97,12 @@ class BackupFolder:
         """Write a backup durably, after all of its objects, and read it back."""
         with drive_errors(self.folder):
             _write_and_read_back(backup_path(self.folder, number), encrypted)
+
+    def replace_keys(self, encrypted: bytes) -> None:
+        """Overwrite the keys of the patients durably, one copy after the other, and read them back."""
+        with drive_errors(self.folder):
+            for name in PATIENT_KEYS:
+                _write_and_read_back(self.folder / name, encrypted, in_place=True)
 
     def _write_header(self, header: BackupHeader) -> None:
         """Write each copy of the header that is missing or unreadable; BackupDamaged if one is of other backups."""
@@ -179,14 +188,17 @@ def find_folder(place: Path) -> Path:
     return found[0]
 
 
-def _write_and_read_back(path: Path, content: bytes) -> None:
+def _write_and_read_back(path: Path, content: bytes, in_place: bool = False) -> None:
     """Write a file durably and compare what the disk, and not the page cache, returns; BackupDamaged if it differs.
 
     Under its own name at once: SHA-256 or age reveal an incomplete file, and on FAT a power cut within a rename can
     damage a complete one.
     """
-    path.unlink(missing_ok=True)  # incomplete, or changed
-    atomic_io.write_file(path, content)
+    if in_place and path.exists():
+        atomic_io.overwrite(path, content)
+    else:
+        path.unlink(missing_ok=True)  # incomplete, or changed
+        atomic_io.write_file(path, content)
     atomic_io.fsync_folder(path.parent)
     if atomic_io.read_from_disk(path) != content:
         raise BackupDamaged(f"{path} cannot be read back as it was written")

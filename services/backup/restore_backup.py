@@ -11,11 +11,11 @@ from pathlib import Path
 from device import atomic_io
 from device.errors import StoreFull
 from services.backup import store_contents
-from services.backup.backup_folder import backup_numbers, backup_path, read_backup_file, read_object
+from services.backup.backup_folder import PATIENT_KEYS, backup_numbers, backup_path, read_backup_file, read_object
 from services.backup.backup_key import SecretKey, read_header
 from services.backup.write_backup import MANIFEST, Manifest
 from services.errors import BackupDamaged, BackupKeyWrong, RestoreRefused
-from services.records import schema
+from services.records import patient_keys, schema
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.restoration import begin_restoration, commit_restoration, finish_restoration
 from services.records.snapshots import carry_dose, refuse_in_use
@@ -72,12 +72,26 @@ def restore_backup(
             part = begin_restoration(store)
             _write_files(part, rest)
             refuse_earlier_store(part / schema.DATABASE, f"the backup in {folder}")
-            damaged = _write_units(part, folder, manifest, key, progress)
+            damaged = _write_keys(part, folder, key) + _write_units(part, folder, manifest, key, progress)
             carry_dose(store / schema.DATABASE, part / schema.DATABASE)
             _sync_folders(part)
             commit_restoration(store)
     progress(len(manifest.units), len(manifest.units))
     return Restored(manifest.number, manifest.made_at, len(manifest.units), damaged, damaged_backups)
+
+
+def _write_keys(part: Path, folder: Path, key: SecretKey) -> tuple[str, ...]:
+    """Write the keys of the patients from the first copy that is whole; return the name of the file if none is."""
+    for name in PATIENT_KEYS:
+        try:
+            files = dict(store_contents.unpacked(key.opened(read_backup_file(folder, folder / name))))
+            if {str(path) for path in files} == set(patient_keys.FILES):  # and no other sealed archive
+                for path, content in files.items():
+                    atomic_io.write_file(part / path, content)
+                return ()
+        except BackupDamaged as error:
+            log.error("%s cannot be used: %s", name, error.message)
+    return PATIENT_KEYS[:1]
 
 
 def _write_units(part: Path, folder: Path, manifest: Manifest, key: SecretKey, progress: Progress) -> tuple[str, ...]:

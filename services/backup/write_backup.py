@@ -12,7 +12,7 @@ from services.backup import store_contents
 from services.backup.backup_folder import BackupFolder
 from services.backup.backup_key import BackupKey, LastBackup, read_key, write_key
 from services.errors import BackupKeyWrong, RecordNotFound
-from services.records import schema
+from services.records import patient_keys, schema
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.storage_errors import storage_errors
 
@@ -95,6 +95,8 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     manifest = Manifest(number=number, made_at=made_at, units=objects)
     content = store_contents.packed({MANIFEST: manifest.model_dump_json().encode(), **rest})
     encrypted = key.header.encrypted(key.sealed(content))
+    keys = store_contents.packed({name: store / name for name in patient_keys.FILES})
+    target.replace_keys(key.header.encrypted(key.sealed(keys)))  # before the backup, which has no later patient
     target.add_backup(number, encrypted)
     progress(len(paths), len(paths))
     return LastBackup(

@@ -14,6 +14,7 @@ from device.errors import DiffuscopeError, StoreError
 from services.errors import NO_FILES_REMEDY
 from services.health import thresholds
 from services.health.thresholds import (
+    MAX_AUDIT_LOG_MB,
     MAX_COMPUTER_C,
     MAX_LATENESS_S,
     MAX_SHOWN_VISITS,
@@ -82,8 +83,8 @@ class StatusSnapshot:
     `unsaved_since`: time of the first capture after that; `unchecked_limits`: names of the light limits that were not
     compared with the purchased standard; `takes_blue_light`: whether the programme lists blue among its colours;
     `settings_problem`: message and remedy of settings of the card that were not taken at the last start;
-    `throttled_bits`: state of supply and clock as the firmware of a Raspberry Pi reports it; `lacks_files`: whether
-    free files, not free bytes, limit `captures_left`.
+    `audit_log_bytes`: size of the audit log; `throttled_bits`: state of supply and clock as the firmware of a Raspberry
+    Pi reports it; `lacks_files`: whether free files, not free bytes, limit `captures_left`.
     """
 
     state: str
@@ -114,6 +115,7 @@ class StatusSnapshot:
     settings_problem: tuple[str, str] | None = None
     throttled_bits: int | None = None
     lacks_files: bool = False
+    audit_log_bytes: int = 0
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -315,6 +317,16 @@ def backup(facts: StatusSnapshot) -> Check:
 BACKUP_REMEDY = "Put in a USB stick and open Backup on the technician's page: what is only on this device can be lost."
 
 
+def audit_log(facts: StatusSnapshot) -> Check:
+    """Check that the audit log is at most MAX_AUDIT_LOG_MB large: it only grows, and each backup holds it."""
+    size_mb = facts.audit_log_bytes / 1e6
+    limit = f"at most {MAX_AUDIT_LOG_MB:.0f} MB"
+    return Check("audit_log", size_mb <= MAX_AUDIT_LOG_MB, f"{size_mb:.0f} MB", limit, AUDIT_LOG_REMEDY)
+
+
+AUDIT_LOG_REMEDY = "A technician stops the instrument and moves the entries to a drive: diffuscope audit archive FILE."
+
+
 BLUE_LIGHT = (
     "; the programme takes blue light, which has 45 times the hazard of green at the same drive"  # OPTICS.md 4.4
 )
@@ -382,6 +394,7 @@ CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     speed,
     sending,
     backup,
+    audit_log,
     light_limits,
     settings,
     power,

@@ -14,6 +14,7 @@ from services.errors import BackupDamaged, RecordErased, RecordRemoved
 from services.health.checks import PressTimes, StatusSnapshot
 from services.health.clock_source import clock_state
 from services.health.instrument_status import InstrumentStatus
+from services.records.audit_log import audit_log_bytes
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
 from services.records.visit_repository import VisitRepository
@@ -63,6 +64,7 @@ def collect_status(
         settings_problem=read_settings_problem(SETTINGS_PROBLEM_FILE),
         throttled_bits=read_throttled_bits(PLATFORM_DEVICES),
         lacks_files=store.space.lacks_files(),
+        audit_log_bytes=audit_log_bytes(store.folder),
     )
 
 

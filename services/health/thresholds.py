@@ -18,6 +18,7 @@ WARM_MARGIN_C = 5.0  # margin below the limit of the head at which it counts as 
 COOLING_S = 300.0  # the text of the alert says five minutes
 VISITS_PER_CHARGE = 60  # visits per charge: an estimate, three hours at three minutes each; no battery is chosen yet
 MAX_UNSAVED_DAYS = 7.0  # age of the first capture that is in no backup: a week of pictures may be lost with the device
+MAX_AUDIT_LOG_MB = 50.0  # about 170,000 entries: each backup holds the whole log
 EARLIEST_DATE = datetime(2026, 1, 1, tzinfo=UTC)  # before the first instrument
 MAX_CLOCK_DRIFT_S = 3600.0  # difference of date and monotonic time; no clock drifts so far in a day
 

@@ -151,7 +151,7 @@ class AuditTrail:
         if (action in REPEATED or not name) and not self._is_new(name or address, action, what):
             return
         more = {"status": str(status), "field": state.get("audit_field", ""), "from": address}
-        more["clock"] = clock_state(self._system)
+        more |= {"patient": state.get("audit_patient", ""), "clock": clock_state(self._system)}
         try:
             await run_in_threadpool(self._log.append, name, action, record, **more)
         except (OSError, DiffuscopeError) as error:

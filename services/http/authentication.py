@@ -12,11 +12,13 @@ from services.errors import RecordNotFound, SecretWrong, SetupRequired, SignInLo
 from services.http.client_limits import Client
 from services.identity.lock_out import LockOut
 from services.identity.logins import Logins
+from services.identity.setup_code import SetupCode
 from services.identity.users import User, UserTable
 
 # The user of a simulated head before the first real user; only a real administrator changes users.
 DEMO_USER = User("Demo", frozenset({"screener", "reader", "technician"}), is_demo=True)
 PROXY_HEADERS = ("forwarded", "via", "x-forwarded-for")
+CODE_REMEDY = "A code is valid for two minutes and five tries. `diffuscope label` on the device makes a new one."
 SETUP_ACCOUNT, UNKNOWN_ACCOUNT = "set-up", "unknown"
 
 
@@ -42,10 +44,18 @@ class Authenticator:
     """Users, their logins and the lock-out of one data folder. Thread-safe.
 
     `has_demo`: until the first user is created, requests from the device itself are those of `DEMO_USER`. `refusal`: as
-    of `UserTable`.
+    of `UserTable`. `tls`: folder of the set-up code.
     """
 
-    def __init__(self, folder: Path, clock: Clock, has_demo: bool = False, refusal: StoreError | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        clock: Clock,
+        has_demo: bool = False,
+        refusal: StoreError | None = None,
+        tls: Path | None = None,
+    ) -> None:
+        self._setup_code = SetupCode(tls or folder, clock)
         self.users = UserTable(folder, refusal)
         self.logins = Logins(self.users, clock)
         self._lock_out = LockOut(folder, clock)
@@ -90,9 +100,9 @@ class Authenticator:
             if self.users.has_begun:
                 raise RecordNotFound("this device was set up already", "Sign in with your name and PIN.")
             self._refuse_early(SETUP_ACCOUNT, peer)
-            if not self.users.is_setup_code(code):
+            if not self._setup_code.is_valid(code):
                 self._lock_out.record_failure(SETUP_ACCOUNT, peer.address)
-                raise SecretWrong("this is not the set-up code", "Type the code that `diffuscope users list` shows.")
+                raise SecretWrong("this is not the set-up code", CODE_REMEDY)
             user = self.users.add(name, secret, DEMO_USER.roles | {"administrator"})
         return self.logins.begin(user)
 

@@ -3,12 +3,14 @@
 The socket is bound first, so that a port in use is an error before any file or device is opened.
 """
 
+import asyncio
 import errno
 import logging
 import os
 import signal
 import socket
-from collections.abc import Callable, Iterator, Mapping
+import ssl
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from threading import Event
 from types import FrameType
-from typing import Self
+from typing import Any, Self
 
 import uvicorn
 from fastapi import FastAPI
@@ -37,6 +39,7 @@ from services.http.authentication import OWN_SCREEN, Authenticator
 from services.http.client_limits import Client
 from services.http.connection_limits import ConnectionLimits, ConnectionTable, LimitedConfig, LimitedListener
 from services.http.log_rate import LOGGER_NAMES, LogRateLimit
+from services.http.pairing import pairing_app
 from services.http.routes.accuracy import accuracy_routes
 from services.http.routes.backup import backup_routes
 from services.http.routes.erasure import erasure_routes
@@ -44,7 +47,9 @@ from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
 from services.identity.audit_key import load_or_create_audit_key
-from services.identity.users import FOLDER, UserTable
+from services.identity.certificates import check_validity, host_names
+from services.identity.renewal import AUTHORITY, SERVER
+from services.identity.users import FOLDER
 from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
 from services.instrument.allocator import return_freed_arrays
 from services.instrument.events import EventBus
@@ -67,19 +72,58 @@ log = logging.getLogger(__name__)
 ACCEPTS = 16  # connections accepted between two steps of the event loop
 LISTEN_QUEUE = 2048  # connections in the kernel until they are accepted; beyond it, a client tries again after 1 s
 SD_LISTEN_FD = 3  # the file descriptor of sd_listen_fds(3)
+PAGE_SOCKET, NETWORK_SOCKET, PAIRING_SOCKET = (f"diffuscope{name}.socket" for name in ("", "-network", "-pairing"))
+RELOAD_TICKS = 10  # of 0.1 s, between two looks at the files of the certificate
 CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # of TLS 1.2; those of 1.3 are all good
-CERTIFICATE_REMEDY = (
-    "Give PEM files that belong together: the certificate with its chain, and its key without a passphrase."
-)
+REMEDY = "Make one with `diffuscope label`, or serve on 127.0.0.1, with `ssh -L 8000:127.0.0.1:8000 THIS-COMPUTER`."
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """PEM files of TLS: certificate with its chain, and its private key."""
+class Listener:
+    """Listening socket of the page, by TLS with a `certificate` (PEM, with its key); or of the pairing page."""
 
-    chain: Path
-    key: Path
+    socket: socket.socket
+    certificate: Path | None = None
+    is_pairing: bool = False
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this computer can connect."""
+        return Client.at(str(self.socket.getsockname()[0])).is_local
+
+    @property
+    def host_names(self) -> list[str]:
+        """Host names of the certificate."""
+        return [] if self.certificate is None else host_names(self.certificate.read_bytes())
+
+
+def open_listeners(
+    environment: Mapping[str, str], host: str, port: int, tls: Path, pairing_port: int
+) -> list[Listener]:
+    """Return the listeners of the sockets of systemd, or of `host`: `port`, and `pairing_port` unless that is 0.
+
+    Beyond this computer the page is served with the certificate in the folder `tls` (services/identity/renewal.py).
+    InputError for an address that cannot be bound, and beyond this computer without a valid certificate.
+    """
+    sockets, file, listeners = inherited_sockets(environment), tls / SERVER, list[Listener]()
+    with ExitStack() as undo:
+        if PAGE_SOCKET not in sockets:
+            ports = {PAGE_SOCKET: port} | ({PAIRING_SOCKET: pairing_port} if pairing_port else {})
+            sockets = {name: undo.enter_context(bind_socket(host, number)) for name, number in ports.items()}
+        elif not file.exists():  # the page of this computer is served all the same
+            sockets = {PAGE_SOCKET: sockets[PAGE_SOCKET]}
+        for name in (PAGE_SOCKET, NETWORK_SOCKET, PAIRING_SOCKET):  # systemd passes them in any order
+            if name not in sockets:
+                continue
+            listener = Listener(sockets[name], is_pairing=name == PAIRING_SOCKET)
+            if not listener.is_local and not listener.is_pairing:
+                listener = Listener(sockets[name], file)
+                _check_certificate(file)
+            if not listener.is_pairing or (tls / AUTHORITY).exists():
+                listeners.append(listener)
+        undo.pop_all()
+    return listeners
 
 
 def bind_socket(host: str, port: int) -> socket.socket:
@@ -107,24 +151,20 @@ def base_url(host: str, port: int, is_tls: bool = False) -> str:
     return f"{'https' if is_tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def require_protection(address: socket.socket, users: UserTable, certificate: Certificate | None) -> None:
-    """Raise InputError for a socket beyond this computer without a user, or without a certificate for TLS."""
-    host = str(address.getsockname()[0])
-    if Client.at(host).is_local or (users.has_begun and certificate is not None):
-        return
-    missing = "there is no certificate for TLS" if users.has_begun else "no user exists yet"
-    raise InputError(
-        f"{host} is open to the network, and {missing}",
-        "Create the first administrator with `diffuscope users add`, and give --certificate and --certificate-key. "
-        "Or serve on 127.0.0.1, and reach it with `ssh -L 8000:127.0.0.1:8000 THIS-COMPUTER`.",
-    )
+def inherited_sockets(environment: Mapping[str, str]) -> dict[str, socket.socket]:
+    """Return the listening sockets that systemd passed to this process (socket activation), by the names of units."""
+    if environment.get("LISTEN_PID") != str(os.getpid()):
+        return {}
+    names = environment.get("LISTEN_FDNAMES", PAGE_SOCKET).split(":")
+    numbers = range(SD_LISTEN_FD, SD_LISTEN_FD + int(environment.get("LISTEN_FDS", 0)))
+    return {name: socket.socket(fileno=number) for name, number in zip(names, numbers, strict=False)}
 
 
-def inherited_socket(environment: Mapping[str, str]) -> socket.socket | None:
-    """Return the listening socket that systemd passed to this process (socket activation); None unless exactly one."""
-    if environment.get("LISTEN_PID") != str(os.getpid()) or environment.get("LISTEN_FDS") != "1":
-        return None
-    return socket.socket(fileno=SD_LISTEN_FD)
+def _check_certificate(file: Path) -> None:
+    try:
+        check_validity(file, file, SystemClock())
+    except ValueError as error:
+        raise InputError(f"the network is served by TLS, and the certificate {file} {error}", REMEDY) from error
 
 
 def _remedy(error: OSError, port: int) -> str:
@@ -139,8 +179,9 @@ def _remedy(error: OSError, port: int) -> str:
 
 def serve(
     spec: InstrumentSpec,
-    address: socket.socket,
+    listeners: Sequence[Listener],
     data: Path,
+    tls: Path,
     ready: Callable[[bool], None],
     watchdog: Watchdog,
     programme: Programme,
@@ -148,22 +189,21 @@ def serve(
     host_names: tuple[str, ...] = (),
     updater: tuple[Path | None, Path | None] = (None, None),
     uploader: Uploader | None = None,
-    certificate: Certificate | None = None,
 ) -> None:
-    """Open the store and the head, call `ready`, and serve at `address` until SIGTERM, SIGINT or a failure.
+    """Open the store and the head, call `ready`, and serve at `listeners` until SIGTERM, SIGINT or a failure.
 
     The page is available while the exam still plans its FFTs; an error that stopped the server is raised at the end.
-    `data`: data folder. `ready` takes whether the page asks for the set-up code of the first user. `host_names`:
-    accepted host names beside the own ones. `measure`: the frontier measurement of this device. `updater`:
-    the updater's state folder and its request folder. `uploader`: uploads to the receiver. `certificate`: of TLS, None
-    for plain HTTP. Everything that was opened is closed at every exit. InputError for an address beyond this computer
-    without users and TLS, SystemExit(0) for a signal before the server runs.
+    `data`: data folder. `tls`: folder of the certificate and the set-up code. `ready` takes whether the page asks for
+    that code. `host_names`: accepted host names beside the own ones. `measure`: the frontier measurement of this
+    device. `updater`: the updater's state folder and its request folder. `uploader`: uploads to the receiver.
+    Everything that was opened is closed at every exit. SystemExit(0) for a signal before the server runs.
     """
     return_freed_arrays()
     clock = SystemClock()
     key = _audit_key(data)
-    with _Stop() as stop, address, opened_store(data, clock, key) as store, ExitStack() as undo, _limited_logs(clock):
-        require_protection(address, UserTable(data / FOLDER), certificate)
+    with _Stop() as stop, ExitStack() as undo, opened_store(data, clock, key) as store, _limited_logs(clock):
+        for listener in listeners:
+            undo.enter_context(listener.socket)
         data = store.folder  # of a read-only store: its copy in memory
         programme = _with_own_numbers(programme, store)
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
@@ -183,20 +223,21 @@ def serve(
             backup_routes(backups, store, UsbDrives(), clock),
             erasure_routes(arbiter, backups),
         ]
-        authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, address), store.refusal)
+        authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, listeners), store.refusal, tls)
         app = create_app(
             arbiter,
             authenticator,
             programme,
-            own_host_names() + host_names,
+            own_host_names() + host_names + tuple(name for listener in listeners for name in listener.host_names),
             technician_routers=routers,
             uploader=uploader,
             audit_log=_audit_log(store, key, clock),
         )
         _log_start(app.http.version, store)
-        server = _limited_server(app.http, clock, context.event_bus, certificate)
+        servers = _limited_servers(app.http, tls, clock, context.event_bus, listeners)
         ready(not authenticator.users.has_begun and authenticator.user(None, OWN_SCREEN) is None)
-        stop.register(server).run(sockets=[address])
+        stop.register(servers[0])
+        asyncio.run(_serve_together(servers, listeners))
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
 
@@ -227,10 +268,10 @@ def _audit_log(store: CaptureStore, key: bytes | None, clock: Clock) -> AuditLog
     return audit_log
 
 
-def _has_demo(spec: InstrumentSpec, address: socket.socket) -> bool:
+def _has_demo(spec: InstrumentSpec, listeners: Sequence[Listener]) -> bool:
     """Return whether the demonstration user may exist: no real lamp or camera, and only this computer can connect."""
     is_played = {spec.light.backend, spec.camera.backend} <= {"sim", "replay"}
-    return is_played and Client.at(str(address.getsockname()[0])).is_local
+    return is_played and all(listener.is_local for listener in listeners)
 
 
 def _with_own_numbers(programme: Programme, store: CaptureStore) -> Programme:
@@ -242,15 +283,28 @@ def _with_own_numbers(programme: Programme, store: CaptureStore) -> Programme:
     return programme if device is None else programme.for_device(device.prefix)
 
 
-def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus, certificate: Certificate | None) -> "Server":
-    table = ConnectionTable(ConnectionLimits(), clock)
-    tls = {} if certificate is None else {"ssl_certfile": certificate.chain, "ssl_keyfile": certificate.key}
-    config = LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1, ssl_ciphers=CIPHERS, **tls)
-    try:
-        config.load()
-    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-        raise InputError(f"the certificate cannot be used: {error}", CERTIFICATE_REMEDY) from error
-    return Server(config, event_bus)
+def _limited_servers(
+    page: FastAPI, tls: Path, clock: Clock, event_bus: EventBus, listeners: Sequence[Listener]
+) -> list["Server"]:
+    """Return a server for each listener; they share the limits of connections, and the first one runs the lifespan."""
+    table, servers = ConnectionTable(ConnectionLimits(), clock), list[Server]()
+    secure_port = next((one.socket.getsockname()[1] for one in listeners if one.certificate is not None), 443)
+    for listener in listeners:
+        app = pairing_app(tls, secure_port) if listener.is_pairing else page
+        options: dict[str, Any] = {"lifespan": "off" if servers else "auto", "ssl_certfile": listener.certificate}
+        config = LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1, ssl_ciphers=CIPHERS, **options)
+        servers.append(Server(config, event_bus))
+    return servers
+
+
+async def _serve_together(servers: Sequence["Server"], listeners: Sequence[Listener]) -> None:
+    """Run all servers until the first one has ended."""
+    first, *others = [server.serve([own.socket]) for server, own in zip(servers, listeners, strict=True)]
+    tasks = [asyncio.create_task(other) for other in others]
+    await first
+    for server in servers:
+        server.should_exit = True
+    await asyncio.gather(*tasks)
 
 
 def _log_start(version: str, store: CaptureStore) -> None:
@@ -342,6 +396,7 @@ class Server(uvicorn.Server):
         super().__init__(config)
         self._connections = config.connections
         self._event_bus = event_bus
+        self._written_ns = 0
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -359,7 +414,21 @@ class Server(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Drop the connections whose time-out is over, ten times per second; return whether the server ends."""
         self._connections.drop_overdue()
+        if self.config.ssl is not None and counter % RELOAD_TICKS == 0:
+            self._reload_certificate(self.config.ssl, Path(str(self.config.ssl_certfile)))
         return await super().on_tick(counter)
+
+    def _reload_certificate(self, context: ssl.SSLContext, file: Path) -> None:
+        """Serve further connections with a certificate that replaced the one in use; open ones keep theirs."""
+        written_ns = file.stat().st_mtime_ns if file.exists() else self._written_ns
+        if written_ns == self._written_ns:
+            return
+        self._written_ns = written_ns
+        try:
+            for used in (ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), context):  # a damaged file reaches the first one only
+                used.load_cert_chain(file)
+        except OSError as error:
+            log.error("the certificate was replaced and cannot be used: %s", error)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Close the event bus, which ends the event streams, then shut down."""

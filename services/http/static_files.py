@@ -1,4 +1,4 @@
-"""Static files of the two pages (exam, technician): served from memory, bundled, gzip-compressed.
+"""Static files of the pages (exam, technician, pairing): served from memory, bundled, gzip-compressed.
 
 Each URL under /web/ contains a hash of all files (cache-busting), so browsers may cache the answer for a year.
 """
@@ -27,14 +27,15 @@ MEDIA_TYPES = {
 PAGES = {
     "index.html": ("app.js", "styles/app.css"),
     "technician.html": ("technician/technician.js", "styles/technician_app.css"),
+    "pairing.html": ("pairing.js", "styles/pairing.css"),
 }
 IMMUTABLE = "public, max-age=31536000, immutable"  # cache-busting: changed files have another URL
 
 
 class StaticFiles:
-    """Files of both pages by URL, plain and gzip-compressed.
+    """Files of all pages by URL, plain and gzip-compressed.
 
-    All URLs except those of the two HTML files change when any file changes (cache-busting).
+    All URLs except those of the HTML files change when any file changes (cache-busting).
     """
 
     def __init__(self, folder: Path = resources.WEB) -> None:
@@ -50,6 +51,10 @@ class StaticFiles:
             self._plain |= {at + name: text.encode() for name, text in contents.items() if not name.endswith(".html")}
             self._plain[html] = texts[html].replace('"/web/', f'"/{at}').encode()
         self._compressed = {name: gzip.compress(content, mtime=0) for name, content in self._plain.items()}
+
+    def text(self, html: str) -> str:
+        """Return the text of an HTML file."""
+        return self._plain[html].decode()
 
     def answer(self, request: Request, name: str, cache_control: str) -> Response:
         """Return the file at URL `name` (without the first slash), gzip-compressed if the browser accepts that.
@@ -67,7 +72,7 @@ class StaticFiles:
 
 @cache
 def page_files() -> StaticFiles:
-    """Return the files of both pages, read and bundled once per process: a changed file needs a restart anyway."""
+    """Return the files of all pages, read and bundled once per process: a changed file needs a restart anyway."""
     return StaticFiles()
 
 

@@ -9,9 +9,8 @@ from services.identity.provision import load_or_create_identity
 
 if __name__ == "__main__":
     computer = Computer()
-    clock = SystemClock()
-    identity = load_or_create_identity(computer.data / "identity", computer.serial(), clock)
-    computer.apply_identity(identity, clock)
+    identity = load_or_create_identity(computer.data / "identity", computer.serial(), SystemClock())
+    computer.apply_identity(identity)
     if (problem := CardBoot().run()) is not None:
         sys.stderr.write(f"The settings of the card were not taken: {problem.message}\n{problem.remedy}\n")
     sys.stdout.write(f"This device is {identity.name}, serial {identity.serial}\n")

@@ -1,4 +1,4 @@
-"""Identity applied at boot: the root file system is volatile, so every boot writes hostname, server key and Wi-Fi."""
+"""Identity applied at boot: the root file system is volatile, so every boot writes hostname, label and Wi-Fi."""
 
 import secrets
 import shutil
@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from device import atomic_io
-from device.clock import Clock
-from services.identity.certificates import create_server_certificate
 from services.identity.provision import Identity
 
 # agetty replaces \4{INTERFACE} by the address, again whenever it changes; without a network nothing stands there.
@@ -39,8 +37,8 @@ class Computer:
         file = self.root / "proc/device-tree/serial-number"
         return file.read_text().rstrip("\0\n").lower() if file.exists() else secrets.token_hex(8)
 
-    def apply_identity(self, identity: Identity, clock: Clock) -> None:
-        """Write hostname, access point configuration, label text, and a new server key with its certificate.
+    def apply_identity(self, identity: Identity) -> None:
+        """Write hostname, access point configuration and label text.
 
         If `root` is "/", also set the kernel's hostname and the journal's machine id.
         """
@@ -48,13 +46,8 @@ class Computer:
         self._write_private(
             "run/NetworkManager/system-connections/access-point.nmconnection", self._access_point(identity)
         )
-        key, certificate = create_server_certificate(
-            identity.authority_key, identity.authority_crt, identity.name, clock
-        )
-        self._write_private("run/diffuscope-identity/server.key", key)
-        self._write_private("run/diffuscope-identity/server.crt", certificate + identity.authority_crt)
         label = LABEL.format(name=identity.name, serial=identity.serial, wifi=identity.wifi)
-        self._write_private("run/issue.d/diffuscope.issue", _qr_code(identity.qr) + label.encode())
+        self._write_private("run/issue.d/diffuscope.issue", qr_code(identity.qr) + label.encode())
         if self.root == Path("/"):
             socket.sethostname(identity.name)
             self._set_machine_id(identity.machine_id)
@@ -86,7 +79,7 @@ class Computer:
         subprocess.run(["systemctl", "restart", "systemd-journald.service"], check=True)
 
 
-def _qr_code(text: str) -> bytes:
+def qr_code(text: str) -> bytes:
     """Return a QR code in Unicode block characters; b"" if qrencode is not installed."""
     if shutil.which("qrencode") is None:
         return b""

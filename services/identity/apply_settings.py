@@ -86,6 +86,12 @@ class CardBoot:
     def _apply_networks(self, settings: CardSettings) -> None:
         if settings.wifi is not None:
             self._write_private(f"{CONNECTIONS}/wifi.nmconnection", wifi_profile(settings.wifi))
+        elif settings.network:
+            access_point = f"{CONNECTIONS}/access-point.nmconnection"
+            profile = (self.root / access_point).read_text()
+            self._write_private(access_point, profile.replace("autoconnect=false", "autoconnect=true"))
+        if settings.network:
+            self._write_public("network", b"")
         if settings.ethernet is not None:
             self._write_private(f"{CONNECTIONS}/ethernet.nmconnection", ethernet_profile(settings.ethernet))
 

@@ -66,13 +66,14 @@ class CardSettings(Table):
     """Content of `diffuscope.toml`; for an absent key the release decides.
 
     `country`: ISO 3166 code, whose rules the radio follows; `head`: a head file of the release, or the name of a file
-    `NAME.toml` beside; `programme`: name of a file beside.
+    `NAME.toml` beside; `programme`: name of a file beside; `network`: whether the page is served to tablets.
     """
 
     country: str | None = Field(default=None, pattern="^[A-Z]{2}$")
     time_zone: str | None = Field(default=None, pattern="^[A-Za-z0-9_+-]+(/[A-Za-z0-9_+-]+)*$")
     head: str | None = Field(default=None, pattern="^[A-Za-z0-9_-]+([.]toml)?$")
     programme: str | None = Field(default=None, pattern="^[A-Za-z0-9_-]+[.]toml$")
+    network: bool = False
     wifi: Wifi | None = None
     ethernet: Ethernet | None = None
     ssh: Ssh | None = None

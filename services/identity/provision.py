@@ -16,7 +16,7 @@ from services.identity.certificates import create_authority
 
 WIFI_CHARACTERS = "abcdefghjkmnpqrstuvwxyz23456789"  # without characters that are misread on a label
 WIFI_GROUPS, WIFI_GROUP_LENGTH = 4, 4  # 31^16: 79 bits
-FILES = ("serial", "machine-id", "wifi", "authority.key", "authority.crt")
+FILES = ("serial", "machine-id", "wifi", "authority.key", "authority.crt", "authority-unconstrained.crt")
 REMEDY = (
     "Copy the captures, call the technician, and keep the device off networks: with this folder gone the next start "
     "makes a new identity, with a new Wi-Fi password and a new label."
@@ -27,7 +27,7 @@ REMEDY = (
 class Identity:
     """Stored identity of a device: serial number of its board, machine id, Wi-Fi password and certificate authority.
 
-    `authority_key` and `authority_crt` are PEM.
+    `authority_key`, `authority_crt` and `unconstrained_crt` are PEM.
     """
 
     serial: str
@@ -35,6 +35,7 @@ class Identity:
     wifi: str
     authority_key: bytes
     authority_crt: bytes
+    unconstrained_crt: bytes
 
     @property
     def name(self) -> str:
@@ -62,11 +63,11 @@ def load_or_create_identity(folder: Path, serial: str, clock: Clock) -> Identity
     if not folder.exists():
         shutil.rmtree(part, ignore_errors=True)  # of an interrupted first boot
         atomic_io.make_folder(folder.parent)
-        key, crt = create_authority(device_name(serial), clock)
+        authority = create_authority(device_name(serial), clock)
         wifi = "-".join(
             "".join(secrets.choice(WIFI_CHARACTERS) for _ in range(WIFI_GROUP_LENGTH)) for _ in range(WIFI_GROUPS)
         )
-        contents = (serial.encode(), secrets.token_hex(16).encode(), wifi.encode(), key, crt)
+        contents = (serial.encode(), secrets.token_hex(16).encode(), wifi.encode(), *authority)
         atomic_io.write_folder(part, dict(zip(FILES, contents, strict=True)))
         atomic_io.replace_durably(part, folder)
     return _read(folder)
@@ -74,11 +75,11 @@ def load_or_create_identity(folder: Path, serial: str, clock: Clock) -> Identity
 
 def _read(folder: Path) -> Identity:
     try:
-        serial, machine_id, wifi, key, crt = ((folder / name).read_bytes() for name in FILES)
+        serial, machine_id, wifi, *authority = ((folder / name).read_bytes() for name in FILES)
     except OSError as error:
         raise StoreDamaged(f"the identity of this device cannot be read: {error}", REMEDY) from error
     words = {"serial": serial, "machine-id": machine_id, "wifi": wifi}
     for name, rule in {"serial": "[0-9a-f]{8,}", "machine-id": "[0-9a-f]{32}", "wifi": "[a-z0-9-]{19}"}.items():
         if not re.fullmatch(rule.encode(), words[name]):
             raise StoreDamaged(f"{folder / name} is not what was kept", REMEDY)
-    return Identity(serial.decode(), machine_id.decode(), wifi.decode(), key, crt)
+    return Identity(serial.decode(), machine_id.decode(), wifi.decode(), *authority)

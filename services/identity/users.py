@@ -1,4 +1,4 @@
-"""Users of a device with their roles and secrets: table in one private file, argon2id hashes, set-up code.
+"""Users of a device with their roles and secrets: table in one private file, argon2id hashes.
 
 The table is read again when its file changes, so that a change by the command is in force at the next request.
 """
@@ -25,11 +25,10 @@ from services.records.json_values import JsonValue
 
 Role = Literal["screener", "reader", "technician", "administrator"]
 ROLES: tuple[Role, ...] = get_args(Role)
-FOLDER, TABLE, BEGUN, SETUP_CODE = "access", "users.json", "users-begun", "setup-code"
+FOLDER, TABLE, BEGUN = "access", "users.json", "users-begun"
 MAX_USERS, MAX_NAME, MAX_SECRET = 200, 40, 200
 GENERATION_BITS = 48  # of the random number at which the generations of a new user begin
 PIN_DIGITS, MIN_PASSPHRASE = 6, 10  # characters; a PIN may have more digits
-CODE_LETTERS, CODE_LENGTH = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789", 8  # 40 bits; without I, O, 0 and 1
 # The least memory that OWASP recommends for argon2id, about 0.1 s on a laptop; a PIN needs the lock-out beside it.
 HASHER = PasswordHasher(time_cost=2, memory_cost=19_456, parallelism=1)
 SECRET_REMEDY = f"Choose {PIN_DIGITS} digits that are no simple sequence, or {MIN_PASSPHRASE} characters or more."
@@ -133,26 +132,6 @@ class UserTable:
             _known(entries, name)
             del entries[_key(name)]
 
-    def setup_code(self) -> str | None:
-        """Return the code with which the first administrator is created, made at the first call; None with users."""
-        if self.has_begun:
-            return None
-        file = self._folder / SETUP_CODE
-        try:
-            return file.read_text(encoding="ascii")
-        except FileNotFoundError:
-            code = "".join(secrets.choice(CODE_LETTERS) for _ in range(CODE_LENGTH))
-            with _disk_errors():
-                atomic_io.make_private(self._folder)
-                atomic_io.write_atomically(file, code.encode())
-            return code
-
-    def is_setup_code(self, code: str) -> bool:
-        """Return whether `code` is the set-up code, in any case of its letters, with or without separators."""
-        known = self.setup_code()
-        typed = "".join(letter for letter in code.upper() if letter.isalnum())
-        return known is not None and secrets.compare_digest(typed.encode(), known.encode())
-
     def _current(self) -> dict[str, _Entry]:
         if not self.has_begun:
             return {}
@@ -181,7 +160,6 @@ class UserTable:
                     raise InputError("no administrator is left", "First make another user an administrator.")
                 atomic_io.write_atomically(self._folder / BEGUN, b"")
                 atomic_io.write_atomically(self._folder / TABLE, _encoded(entries))
-                (self._folder / SETUP_CODE).unlink(missing_ok=True)
 
 
 @contextmanager

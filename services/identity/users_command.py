@@ -42,12 +42,12 @@ def reset(name: Name, data: Data, secret_file: SecretFile = None) -> None:
 @app.command("list")
 @announced("reading the users")
 def list_users(data: Data) -> None:
-    """Name every user with the roles; before the first one, the set-up code for the page."""
+    """Name every user with the roles."""
     table = UserTable(data / FOLDER)
     for user in table.users():
         typer.echo(f"{user.name}: {', '.join(sorted(user.roles))}")
-    if (code := table.setup_code()) is not None:
-        typer.echo(f"No user yet. The set-up code for the page: {code[:4]}-{code[4:]}")
+    if not table.has_begun:
+        typer.echo("No user yet. `diffuscope label` prints the set-up code for the page")
 
 
 def _secret(file: Path | None) -> str:

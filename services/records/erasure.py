@@ -30,8 +30,8 @@ from services.errors import RecordNotFound, StoreDamaged
 from services.records import blobs, digested_json, numbering, schema
 from services.records.device_identity import read_device
 from services.records.json_values import Timestamp
-from services.records.patient_index import index_of
 from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import index_of
 from services.records.reserve_file import ReserveFile
 from services.records.schema import CaptureRow, FileRow, IdempotencyKeyRow, PatientRow, VisitRow
 from services.records.storage_errors import storage_errors

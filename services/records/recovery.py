@@ -37,6 +37,7 @@ from services.records import record_rows, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.json_values import JsonObject
+from services.records.patient_rows import index_of
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles, new_key, note_key
 from services.records.record_rows import Content
@@ -125,6 +126,7 @@ class Recovery:
             if as_described and not missing:
                 write_signature(session, document)
         self._files.write_all([*to_write, *sign_changed(session)])
+        index_of(session).numbers(session)  # decrypts all of them now, not in the first search
         if self._new_key is not None:
             RecordFiles(self._folder, self._new_key).write_all(_documents(session))
             note_key(self._folder, self._new_key)

@@ -17,7 +17,7 @@ from services.errors import RecordErased, RecordNotFound, StoreDamaged
 from services.records import blobs, record_signing, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
 from services.records.earlier_stores import refuse_earlier_store
-from services.records.patient_keys import PatientKeys
+from services.records.patient_keys import DEVICE, PatientKeys, ids_in_files
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles
 from services.records.recovery import damage_of
@@ -63,6 +63,7 @@ def check_store(folder: Path, progress: Progress, key: bytes | None = None) -> l
             progress(f"reading the {name}")
             rows = _records_in_rows(folder, kind) if database.is_whole else ()
             results.append(_checked_records(folder, files, kind, rows, documents))
+        results.append(_checked_keys(folder, [id for kind, id in documents if kind == "patient"]))
         progress("reading the files of the captures")
         results.append(_checked_files(folder, documents, key))
     return results
@@ -86,6 +87,17 @@ def _checked_ledger(folder: Path, key: bytes | None) -> Checked:
         result.healable.append("no valid entry")
     else:
         result.whole = 1
+    return result
+
+
+def _checked_keys(folder: Path, patients: list[str]) -> Checked:
+    """Look for the key of the device and of each patient in both files; one that is in neither is damaged."""
+    result, (first, second) = Checked("keys of patients"), ids_in_files(folder)
+    for id in (DEVICE, *patients):
+        if id in first and id in second:
+            result.whole += 1
+        else:
+            (result.healable if id in first or id in second else result.damaged).append(id or "the device")
     return result
 
 

@@ -79,12 +79,13 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Visit:
-    """One visit of the patient with that number; timestamps are UTC, `day` is the local date (ISO 8601).
+    """One visit of the patient with that opaque id and number; timestamps are UTC, `day` is the local date (ISO 8601).
 
     `fields`: answers by form field; `slots`: state by slot id. `finished_at`, `outcome`: None in an unfinished visit.
     """
 
     id: str
+    patient_id: str
     number: str
     day: str
     begun_at: datetime

@@ -26,6 +26,7 @@ from services.records.store_check import check_store
 from tests.archive.conftest import COMMAND, Archive, result_digests
 from tests.archive.test_archive_runs import wait_for_results
 from tests.journey.conftest import SMALL_HEAD, coarsened, rig_builder
+from tests.stored_captures import kept_content
 
 TINTS: tuple[Colour, ...] = ("green", "red")
 READY_S, PRESS_S = 300.0, 120.0
@@ -64,7 +65,7 @@ def ran(
     place = store / "captures" / first.id
     (root / "folder").mkdir()
     for old, new in (("raw", "eye"), ("raw-1", "eye-1"), ("raw-red", "eye-red")):
-        shutil.copy(place / f"{old}.tiff", root / "folder" / f"{new}.tiff")
+        (root / "folder" / f"{new}.tiff").write_bytes(kept_content(place / f"{old}.tiff"))
     (kept,) = (store / "calibrations" / "small").glob("*/")
     stored = Calibrations(kept.parent).load(kept.name).calibration
     for psf in stored.psfs:
@@ -101,7 +102,7 @@ def test_whole_captures_are_computed_as_the_instrument_does(
 def likeness(picture: np.ndarray, stored: Path) -> float:
     """Return the correlation of the middle of a linear picture with that of a stored one, which is cropped."""
     parts = []
-    for image in (picture, read_png(stored.read_bytes())):
+    for image in (picture, read_png(kept_content(stored))):
         rows, cols = image.shape[0] // 2, image.shape[1] // 2
         parts.append(image[rows - 20 : rows + 20, cols - 20 : cols + 20].astype(float).ravel())
     return float(np.corrcoef(*parts)[0, 1])

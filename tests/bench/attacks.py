@@ -70,7 +70,7 @@ class Instrument:
         words = ["run", "--head", "hardware/heads/sim.toml", "--port", str(self.port)]
         if self._is_open:
             self._write_identity()
-            files = (str(self._data / "server.crt"), "--certificate-key", str(self._data / "server.key"))
+            files = (str(self._data / "server.pem"), "--certificate-key", str(self._data / "server.pem"))
             words += ["--host", "0.0.0.0", "--certificate", *files]
         command = [str(self._tree / ".venv/bin/diffuscope"), *words, "--data", str(self._data)]
         with self._log.open("wb") as log:
@@ -114,9 +114,8 @@ class Instrument:
         """Add the user of the presses, and write a key with its certificate."""
         if not (users := UserTable(self._data / FOLDER)).has_begun:
             users.add("Asha", PIN, ROLES)
-        key, certificate = create_server_certificate(*create_authority("bench", SystemClock()), "bench", SystemClock())
-        for name, content in (("server.key", key), ("server.crt", certificate)):
-            (self._data / name).write_bytes(content)
+        authority = create_authority("bench", SystemClock())[:2]
+        (self._data / "server.pem").write_bytes(create_server_certificate(*authority, "bench", SystemClock()))
 
     def _state(self) -> str | None:
         try:

@@ -61,6 +61,7 @@ class Server:
         self.before: list[str] = []  # prefix of the command, such as `nice`
         self.more: list[str] = []  # additional arguments of `run`
         self.first_on_path: Path | None = None  # first entry of PYTHONPATH; its metadata sets the version
+        self.ready_path = "/api/status"
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._log = (data.parent / "server.log").open("ab")
@@ -79,7 +80,7 @@ class Server:
             assert self._process is not None
             assert self._process.poll() is None, f"the server ended: {Path(self._log.name).read_text()[-2000:]}"
             try:
-                with urllib.request.urlopen(f"{self.url}/api/status", timeout=2) as answer:
+                with urllib.request.urlopen(f"{self.url}{self.ready_path}", timeout=2) as answer:
                     answer.read()
                 return
             except OSError:

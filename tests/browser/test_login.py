@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
+from device.clock import SystemClock
+from services.identity.setup_code import SetupCode
 from services.identity.users import FOLDER, UserTable
 from tests.browser.axe import axe_faults
 from tests.browser.conftest import Complaints, Server
@@ -117,7 +119,7 @@ def test_a_new_device_is_set_up_with_its_code(own_server: Server, open_page: Ope
     dialog = page.locator("dialog.login")
     expect(dialog).to_contain_text("Set up this device", timeout=20_000)
     assert faults(page) == []
-    dialog.locator("[name=code]").fill(UserTable(own_server.data / FOLDER).setup_code() or "")
+    dialog.locator("[name=code]").fill(SetupCode(own_server.data / "tls", SystemClock()).create())
     dialog.locator("[name=name]").fill("Asha")
     for name in ("secret", "again"):
         dialog.locator(f"[name={name}]").fill(PIN)

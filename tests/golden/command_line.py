@@ -90,6 +90,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "white-card --head {0}/head.toml --archive {0}/a",
     "audit verify",
     "audit verify --data {0}/audited",
+    "audit archive {0}/entries.jsonl --data {0}/audited",
     "programme check {0}/none.toml",
     "users add Asha --role pilot --data {0}/audited",
     "users list",

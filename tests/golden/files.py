@@ -55,6 +55,7 @@ SETTINGS = 'address = "https://reader.example.org/inbox"\ntoken = "send.token"\n
 NAMES = re.compile(r"\d{8}T\d{6}-(?:(?:OD|OS)-)?[0-9a-f]{6}")
 PATIENT = re.compile(r"\b(?!0{8})[0-9a-f]{16}\b")
 DIGEST = re.compile(r"\b[0-9a-f]{64}\b")
+ENCRYPTED = re.compile(r"[A-Za-z0-9+/]{40,}={0,2}")  # base64 of a nonce, a short content and a tag
 
 
 # Writing
@@ -350,8 +351,8 @@ def keys_of(value: Any) -> Any:
 
 
 def numbered(value: Any) -> Any:
-    """Return the value with names of captures and visits numbered, and digests replaced by a placeholder."""
-    text = PATIENT.sub("patient", DIGEST.sub("sha256", json.dumps(value)))
+    """Return the value with names of captures and visits numbered, digests and encrypted texts as placeholders."""
+    text = ENCRYPTED.sub("encrypted", PATIENT.sub("patient", DIGEST.sub("sha256", json.dumps(value))))
     for number, name in enumerate(dict.fromkeys(NAMES.findall(text)), 1):
         text = text.replace(name, f"name-{number}")
     return json.loads(text)

@@ -4,8 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from device.clock import boot_id
 from services.delivery.upload_worker import BACKOFF_FIRST_S
-from services.identity.users import SETUP_CODE
+from services.identity.setup_code import FILE
 from tests.golden import compare
 from tests.golden.instrument import Refusing, instrument, until
 from tests.golden.transcript import Transcript
@@ -250,7 +251,7 @@ def access() -> list[dict[str, Any]]:
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         (device.folder / "access").mkdir()
-        (device.folder / "access" / SETUP_CODE).write_text(CODE)  # otherwise a random one
+        (device.folder / "access" / FILE).write_text(f"{CODE} {boot_id()} 0")  # otherwise a random one
         log.ask("GET /api/login", note="the demonstration user")
         log.ask("POST /api/login", json=ASHA, note="no user exists yet")
         log.ask("POST /api/setup", json=ASHA | {"code": "AAAAAAAA"})

@@ -29,7 +29,7 @@ TINTS: tuple[Colour, ...] = ("green", "red")
 
 @pytest.fixture(scope="module")
 def pressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
-    """The store of a simulated instrument with its calibration, and a press: a burst in green, one frame in red."""
+    """A simulated instrument with its calibration, and copies of the files of a press: a burst in green, one in red."""
     root = tmp_path_factory.mktemp("instrument")
     (root / "head.toml").write_text(SMALL_HEAD)
     world, calibration = coarsened(load_head(root / "head.toml"))
@@ -37,6 +37,8 @@ def pressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
         rig = rig_builder((world, calibration), root / "plans")(root, undo, tinted=TINTS, wait=False)
         assert rig.exam.ready.wait(READY_S)
         capture = rig.exam.press("OD", None, CaptureTarget(frames=4)).result(PRESS_S)
+    copied = call(["store", "copy", capture.id, "--data", str(root / "store"), "-o", str(root / "copied")])
+    assert copied.code == 0, copied.err
     psfs = tuple(Psf(crop_or_pad(world.psf(colour), world.shape), colour, colour) for colour in TINTS)
     calibration = replace(calibration, psfs=psfs)
     Archive(root / "calibrations").add_and_activate(calibration, Provenance("D1", VirtualClock().wall(), "test", "0"))
@@ -45,7 +47,7 @@ def pressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
 
 def reconstructed(root: Path, capture: Capture, *frames: str) -> tuple[Any, Any]:
     """Return picture and report of `diffuscope reconstruct` for frames of a stored capture."""
-    place, made = root / "store" / "captures" / capture.id, root / "again"
+    place, made = root / "copied" / capture.id, root / "again"
     made.mkdir(exist_ok=True)
     words = [
         "reconstruct",
@@ -66,7 +68,7 @@ def reconstructed(root: Path, capture: Capture, *frames: str) -> tuple[Any, Any]
 
 def test_a_burst_has_the_residual_and_the_picture_of_its_press(pressed: tuple[Path, Capture]) -> None:
     root, capture = pressed
-    stored, place = capture.report, root / "store" / "captures" / capture.id
+    stored, place = capture.report, root / "copied" / capture.id
     names = burst_of(capture)
     picture, report = reconstructed(root, capture, *names)
     assert [use["used"] for use in report["frames"]] == [use.used for use in stored.frames]
@@ -82,7 +84,7 @@ def test_a_burst_has_the_residual_and_the_picture_of_its_press(pressed: tuple[Pa
 
 def test_a_colour_press_is_repeated_with_its_calibration(pressed: tuple[Path, Capture]) -> None:
     root, capture = pressed
-    stored, place = capture.report, root / "store" / "captures" / capture.id
+    stored, place = capture.report, root / "copied" / capture.id
     channels = [word for name in burst_of(capture) for word in ("--channel", "green", name)]
     picture, report = reconstructed(root, capture, *channels, "--channel", "red", "raw-red.tiff")
     assert report["residual"] == pytest.approx(stored.residual, rel=0.02)

@@ -1,6 +1,7 @@
 """Access control: every endpoint with every role, without a login, and with an ended one; set-up and users."""
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from datetime import datetime, timedelta
@@ -22,10 +23,12 @@ from services.http.authentication import OWN_SCREEN, Authenticator, Peer
 from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
+from services.identity.setup_code import SetupCode
 from services.identity.users import ROLES, Role
 from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
+from services.records.patient_keys import ids_in_files
 from tests.golden import http_transcript
 from tests.journey.conftest import Rig, read_event_stream
 
@@ -228,7 +231,7 @@ def test_the_demonstration_ends_for_good_with_the_first_user(fresh: Rig) -> None
 
 
 def test_set_up_signs_in_the_first_administrator_once(fresh: Rig) -> None:
-    code = fresh.authenticator.users.setup_code()
+    code = SetupCode(fresh.store.folder.parent / "access", fresh.clock).create()
     asha = {"name": "Asha", "secret": PIN}
     wrong = ask(fresh.app, "POST", "/api/setup", json=asha | {"code": "AAAA-AAAA"})
     assert (wrong.status_code, wrong.json()["code"]) == (403, "access.wrong")
@@ -242,6 +245,28 @@ def test_set_up_signs_in_the_first_administrator_once(fresh: Rig) -> None:
     assert all(part in cookie for part in ("login=", "httponly", "samesite=strict", "path=/"))
     assert "max-age" not in cookie
     assert ask(fresh.app, "POST", "/api/setup", json=asha | {"code": code}).status_code == 404
+
+
+def test_a_thousand_wrong_codes_end_the_code_and_are_in_the_audit_log(fresh: Rig, tmp_path: Path) -> None:
+    """One each second, from two addresses; the right code is then refused, and a new label is accepted."""
+    log = AuditLog(tmp_path, b"k" * 32, fresh.clock)
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
+    codes = SetupCode(fresh.store.folder.parent / "access", fresh.clock)
+    code, asha = codes.create(), {"name": "Asha", "secret": PIN}
+    answers: Counter[str] = Counter()
+    for number in range(1000):
+        if number % 100 == 0:
+            code = codes.create()
+        answer = ask(app, "POST", "/api/setup", client=(AWAY, HERE)[number % 2], json=asha | {"code": f"WRONG{number}"})
+        answers[answer.json()["code"]] += 1
+        fresh.clock.sleep(1)
+    assert set(answers) == {"access.wrong", "access.wait"}
+    assert answers["access.wrong"] < 30, "the wait doubles"
+    fresh.clock.sleep(300)
+    assert ask(app, "POST", "/api/setup", client=HERE, json=asha | {"code": code}).status_code == 403
+    assert len(log.entries(2000, action="set-up")) == 1001
+    fresh.clock.sleep(300)
+    assert ask(app, "POST", "/api/setup", client=HERE, json=asha | {"code": codes.create()}).status_code == 200
 
 
 def test_over_tls_the_cookie_is_bound_to_the_host(fresh: Rig) -> None:
@@ -403,7 +428,8 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
     ask(app, "POST", "/api/login", json={"name": "Asha", "secret": "000000"})
     fresh.clock.sleep(1)
     token = ask(app, "POST", "/api/login", json={"name": "Asha", "secret": PIN}).cookies["login"]
-    visit = ask(app, "POST", "/api/visits", token, json={"key": "0" * 16}).json()["id"]
+    begun = ask(app, "POST", "/api/visits", token, json={"key": "0" * 16}).json()
+    visit, number = begun["id"], begun["number"]
     at = f"/api/visits/{visit}"
     ask(app, "PATCH", at, token, json={"key": "1" * 16, "field": "name", "value": "Meena K."})
     for _ in range(3):
@@ -428,7 +454,12 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
         ("", "refused", "", None, "400"),
     ]
     assert {one.more["clock"] for one in log.entries(100)} == {"not_set"}
-    assert b"Meena" not in (tmp_path / "audit-log.jsonl").read_bytes()
+    patients = [one.more["patient"] for one in log.entries(100) if one.action in {"begin-visit", "answer"}]
+    assert len(patients) == 2
+    assert set(patients) <= ids_in_files(fresh.store.folder)[0]
+    content = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())  # store and logs
+    assert visit.encode() in content
+    assert not [text for text in ("Meena", number) if text.encode() in content]
     shown = ask(app, "GET", "/api/audit?action=sign-in", token).json()
     assert ([entry["number"] for entry in shown["entries"]], shown["problem"]) == ([2, 1], None)
     (tmp_path / "audit-log.jsonl").write_bytes(b"")
@@ -439,3 +470,4 @@ def test_without_room_for_the_audit_log_the_exam_goes_on(fresh: Rig, tmp_path: P
     log = AuditLog(tmp_path / "missing", b"k" * 32, fresh.clock)
     app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
     assert ask(app, "POST", "/api/visits", client=HERE, json={"key": "0" * 16}).status_code == 201
+    assert ask(app, "POST", "/api/captures", client=HERE, json={"eye": "OD"}).status_code == 201

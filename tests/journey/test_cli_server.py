@@ -1,29 +1,37 @@
 """`diffuscope run` as a process: killed during a capture, restarted, ended by a signal."""
 
+import hashlib
 import http.client
 import json
+import re
 import signal
 import socket
 import ssl
 import subprocess
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
+from datetime import UTC, datetime
 from io import BytesIO
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 import tifffile
+from starlette.requests import Request
 
-from device.clock import SystemClock
+from device import atomic_io
+from device.clock import SystemClock, VirtualClock
 from device.errors import InputError
-from services.http.server import Certificate, bind_socket, require_protection
+from services.http.server import open_listeners
+from services.http.static_files import page_files
 from services.identity.certificates import create_authority, create_server_certificate
-from services.identity.users import ROLES, UserTable
-from tests.journey.conftest import COMMAND, ROOT, Diffuscope
+from tests.journey.conftest import COMMAND, ROOT, Diffuscope, until
 
 
 class Server:
@@ -38,6 +46,7 @@ class Server:
         self._log = data.with_suffix(".log")
         self._environment = environment
         self.trusted: ssl.SSLContext | None = None  # of a page that is served by TLS
+        self.ready_path = "/api/status"
 
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[bytes]]:
@@ -58,7 +67,7 @@ class Server:
         while time.monotonic() < end:
             assert process.poll() is None, self.output()
             try:
-                self.ask("GET", "/api/status")
+                self.ask("GET", self.ready_path)
                 return
             except OSError:
                 time.sleep(0.05)
@@ -153,34 +162,95 @@ def test_a_data_folder_of_a_version_before_the_first_release_is_refused_before_t
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["shelf.sqlite"]
 
 
-def test_an_address_beyond_this_computer_needs_a_user_and_tls(tmp_path: Path) -> None:
-    """Socket and table of the users decide, before any part of a head is opened."""
-    users, certificate = UserTable(tmp_path), Certificate(tmp_path / "crt.pem", tmp_path / "key.pem")
-    with bind_socket("127.0.0.1", 0) as own, bind_socket("0.0.0.0", 0) as open_to_all:
-        for tls in (None, certificate):
-            require_protection(own, users, tls)
-            with pytest.raises(InputError, match="no user exists yet") as refusal:
-                require_protection(open_to_all, users, tls)
-            assert "users add" in refusal.value.remedy
-        users.add("Asha", "274913", ROLES)
-        with pytest.raises(InputError, match="no certificate"):
-            require_protection(open_to_all, users, None)
-        require_protection(open_to_all, users, certificate)
+def test_an_address_beyond_this_computer_needs_tls(tmp_path: Path) -> None:
+    """The certificate decides, before any part of a head is opened; an expired or foreign one is none."""
+    [own] = open_listeners({}, "127.0.0.1", 0, tmp_path, 0)
+    with own.socket:
+        assert (own.is_local, own.certificate) == (True, None)
+    with pytest.raises(InputError, match="the network is served by TLS") as refusal:
+        open_listeners({}, "0.0.0.0", 0, tmp_path, 0)
+    assert "diffuscope label" in refusal.value.remedy
+    authority = create_authority("eye", SystemClock())
+    (tmp_path / "authority.crt").write_bytes(authority[1])
+    for moment in (datetime(2999, 1, 1, tzinfo=UTC), datetime.now(UTC)):  # the first is not expired before 3000
+        pem = create_server_certificate(*authority[:2], "eye", VirtualClock(moment))
+        (tmp_path / "server.pem").write_bytes(pem)
+        [page, pairing] = open_listeners({}, "0.0.0.0", 0, tmp_path, free_port())
+        with page.socket, pairing.socket:
+            assert (page.certificate, pairing.certificate) == (tmp_path / "server.pem", None)
+            assert [one.is_pairing for one in (page, pairing)] == [False, True]
+    other = create_server_certificate(*authority[:2], "eye", SystemClock()).partition(b"-----BEGIN CERTIFICATE")[0]
+    (tmp_path / "server.pem").write_bytes(other + pem[pem.index(b"-----BEGIN CERTIFICATE") :])
+    with pytest.raises(InputError, match="cannot be used with its key"):
+        open_listeners({}, "0.0.0.0", 0, tmp_path, 0)
 
 
-def test_the_page_is_served_by_tls_with_given_files(
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_a_replaced_certificate_is_served_without_a_restart_and_nothing_but_pairing_before_the_first_user(
     served_head: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
+    """Address changed: the page answers by TLS, and pairing by plain HTTP; a damaged certificate changes nothing."""
+    tls, pairing_port = tmp_path / "data/tls", free_port()
+    tls.mkdir(parents=True)
     authority = create_authority("eye", SystemClock())
-    for name, content in zip(
-        ("key.pem", "crt.pem"), create_server_certificate(*authority, "eye", SystemClock()), strict=True
-    ):
-        (tmp_path / name).write_bytes(content)
-    (tmp_path / "authority.pem").write_bytes(authority[1])
-    words = ("--certificate", str(tmp_path / "crt.pem"), "--certificate-key", str(tmp_path / "key.pem"))
+    for name, pem in (("authority.crt", authority[1]), ("authority-unconstrained.crt", authority[2])):
+        (tls / name).write_bytes(pem)
+    write_leaf(tls, authority, "127.0.0.1")
+    words = ("--host", "0.0.0.0", "--pairing-port", str(pairing_port))
     server = Server(served_head, tmp_path / "data", environment, *words)
-    server.trusted = ssl.create_default_context(cafile=str(tmp_path / "authority.pem"))
-    server.trusted.check_hostname = False  # the names of the certificate are those of a device
+    server.trusted = ssl.create_default_context(cafile=str(tls / "authority.crt"))
+    server.ready_path = "/api/login"
     with server.running():
-        assert server.ask("GET", "/api/login")["user"]["is_demo"]
-        assert "Open https://127.0.0.1" in server.output()
+        assert server.ask("GET", "/api/login") == {"user": None, "needs_setup": True, "idle_s": 300.0}
+        for path in ("/api/visits", "/api/captures", "/api/users", "/api/audit", "/api/openapi.json"):
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                server.ask("GET", path)
+            assert json.loads(refused.value.read())["code"] == "access.setup"
+        plain(pairing_port, server.port, authority)
+        before = leaf_of(server.port)
+        (tls / "server.pem").write_bytes(b"damaged")
+        time.sleep(2.5)  # two looks at the file
+        assert leaf_of(server.port) == before
+        write_leaf(tls, authority, "10.1.2.3")
+        until(lambda: leaf_of(server.port) != before)
+        with pytest.raises(urllib.error.URLError, match="IP address mismatch"):
+            server.ask("GET", "/api/login")  # a tablet at the old address, which the device no longer has
+        log = "".join(file.read_text() for file in (tmp_path / "data/event-log").iterdir())
+        assert "the certificate was replaced and cannot be used" in log
+
+
+def write_leaf(tls: Path, authority: tuple[bytes, bytes, bytes], address: str) -> None:
+    pem = create_server_certificate(*authority[:2], "eye", SystemClock(), [ip_address(address)])
+    atomic_io.write_atomically(tls / "server.pem", pem)
+
+
+def leaf_of(port: int) -> str:
+    return ssl.get_server_certificate(("127.0.0.1", port))
+
+
+def plain(port: int, https_port: int, authority: tuple[bytes, bytes, bytes]) -> None:
+    """Check the pairing page: itself, its files, the authorities, and nothing else; no cookie, no redirection."""
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}") as tablet:
+        digest = hashlib.sha256(ssl.PEM_cert_to_DER_cert(authority[1].decode())).hexdigest()
+        page = tablet.get("/")
+        assert bytes.fromhex(digest).hex(" ").upper() in page.text
+        assert f'data-port="{https_port}"' in page.text
+        assert page.status_code == 200
+        assert tablet.get(re.findall(r'src="(/web/[^"]+)"', page.text)[0]).status_code == 200
+        for name, pem in (("authority", authority[1]), ("authority-unconstrained", authority[2])):
+            answer = tablet.get(f"/{name}.crt")
+            assert (answer.headers["content-type"], answer.content) == ("application/x-x509-ca-cert", pem)
+        exam = page_files().answer(Request({"type": "http", "headers": []}), "index.html", "").body.decode()
+        others = ["/api/login", "/api/status", "/technician", "/server.crt", "/authority.key", "/docs", "/openapi.json"]
+        others += re.findall(r'src="(/web/[^"]+)"', exam)
+        assert [tablet.get(path).status_code for path in others] == [404] * 3 + [422] + [404] * 4
+        assert tablet.post("/api/setup", json={}).status_code == 404
+        assert tablet.post("/", content=b"x" * 100_000).status_code == 405
+        assert tablet.get("/", headers={"Host": "evil.example"}).status_code == 400
+        assert not tablet.cookies
+        assert page.headers["Cross-Origin-Resource-Policy"] == "same-origin"

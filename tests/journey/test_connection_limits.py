@@ -156,10 +156,10 @@ def test_a_new_connection_is_refused_while_all_are_answered() -> None:
 def tls(tmp_path: Path) -> dict[str, Path]:
     """uvicorn's options of TLS with a certificate of `authority.pem`."""
     authority = create_authority("eye", SystemClock())
-    key, certificate = create_server_certificate(*authority, "eye", SystemClock())
-    for name, content in (("key.pem", key), ("crt.pem", certificate), ("authority.pem", authority[1])):
+    pem = create_server_certificate(*authority[:2], "eye", SystemClock())
+    for name, content in (("server.pem", pem), ("authority.pem", authority[1])):
         (tmp_path / name).write_bytes(content)
-    return {"ssl_keyfile": tmp_path / "key.pem", "ssl_certfile": tmp_path / "crt.pem"}
+    return {"ssl_keyfile": tmp_path / "server.pem", "ssl_certfile": tmp_path / "server.pem"}
 
 
 def test_connections_without_a_tls_handshake_are_limited_as_others(tls: dict[str, Path]) -> None:

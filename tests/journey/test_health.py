@@ -25,6 +25,7 @@ def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait
         "speed",
         "sending",
         "backup",
+        "audit_log",
         "light_limits",
         "settings",
         "power",

@@ -8,12 +8,16 @@ import pytest
 from device.light_safety.guard import GuardedLight
 from device.values import Eye
 from services.health.probe import probe_instrument
+from services.http.authentication import OWN_SCREEN
 from services.http.connection_limits import ConnectionLimits
+from services.identity.logins import IDLE_LOCK_S
+from services.identity.users import ROLES
 from tests.journey.asking import post_capture, status_problem, visit_with_consent
 from tests.journey.conftest import MakeRig, Rig
 from tests.journey.faults import wait_until_idle
 from tests.journey.serving import served
 
+PIN = "274913"
 OTHER_EYE: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
 SLOTS: dict[Eye, str] = {"OD": "R-centre", "OS": "L-centre"}
 
@@ -86,6 +90,39 @@ def test_light_without_a_visit_ends_while_a_visit_gets_light(make_rig: MakeRig) 
 def request_lease(rig: Rig, key: str, **more: Any) -> bool:
     """Request the control lease; return whether the screen holds it now."""
     return bool(rig.request("POST", "/api/controller", json={"key": key} | more).json()["mine"])
+
+
+@pytest.mark.parametrize("ends_by", ["sign-out", "idle lock"])
+def test_the_lamp_goes_dark_when_the_user_is_signed_out_or_idle(make_rig: MakeRig, ends_by: str) -> None:
+    """No request but those of the user lights the lamp; the exam and its visit stay as they are."""
+    rig = make_rig()
+    visit = visit_with_consent(rig)["id"]
+    rig.authenticator.users.add("Asha", PIN, ROLES)
+    login = {"Cookie": f"login={rig.authenticator.sign_in('Asha', PIN, OWN_SCREEN)}"}
+
+    def status(method: str, path: str) -> int:
+        for _ in range(20):  # while no picture comes in time on a busy computer
+            code = int(rig.request(method, path, headers=login | {"X-Controller": "1" * 16}).status_code)
+            if code != 204:
+                break
+        return code
+
+    live = f"/api/preview?after=0&eye=OD&visit={visit}"
+    assert status("GET", live) == 200
+    if ends_by == "sign-out":
+        assert status("DELETE", "/api/login") == 200
+    else:
+        rig.clock.elapsed_s += IDLE_LOCK_S
+    assert status("GET", live) == 401
+    given = doses_j_per_cm2(rig)
+    for method, path in (("GET", live), ("POST", "/api/captures"), ("POST", "/api/calibration")):
+        assert status(method, path) == 401
+    assert rig.world.illumination is None
+    assert doses_j_per_cm2(rig)["OD"] <= given["OD"], "the last reservation may have been settled since"
+    assert rig.request("GET", "/api/status").json()["state"] == "aim"
+    login["Cookie"] = f"login={rig.authenticator.sign_in('Asha', PIN, OWN_SCREEN)}"
+    assert status("GET", f"/api/visits/{visit}") == 200
+    assert status("GET", live) == 200
 
 
 LIT_BY: dict[str, dict[str, Any]] = {

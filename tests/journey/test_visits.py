@@ -213,8 +213,9 @@ def test_the_history_of_a_visit_keeps_what_was_who_changed_it_and_why(old_rig: A
     assert [(one["number"], one["user"], one["field"], one["was"], one["value"], one["why"]) for one in changes] == [
         (1, "Demo", "vision_od", None, "6/60", None),
         (2, "Demo", "vision_od", "6/60", "6/6", None),
-        (3, "Demo", "outcome", None, "refer_picture", None),
-        (4, "Demo", "outcome", "refer_picture", None, "answer"),
+        (3, "Demo", "name", None, "Meena", None),
+        (4, "Demo", "outcome", None, "refer_picture", None),
+        (5, "Demo", "outcome", "refer_picture", None, "answer"),
     ]
     assert [one["at"] for one in changes] == sorted(one["at"] for one in changes)
     assert old_rig.request("GET", "/api/visits/none/changes").status_code == 404

@@ -2,6 +2,8 @@
 
 import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +12,11 @@ from typing import Any
 
 import pytest
 
-from services.http.server import inherited_socket
+from device.clock import SystemClock
+from services.http.server import inherited_sockets
+from services.identity.certificates import create_authority, create_server_certificate
 from services.instrument.watchdog import BEAT_S, Watchdog
-from tests.journey.conftest import until
+from tests.journey.conftest import ROOT, until
 
 
 class NotifySocket:
@@ -124,6 +128,34 @@ def test_a_blocked_head_thread_sends_no_heartbeats(make_rig: Any, notify_socket:
 
 
 def test_a_passed_socket_is_accepted_only_by_its_addressee() -> None:
-    assert inherited_socket({}) is None
-    assert inherited_socket({"LISTEN_PID": str(os.getpid() + 1), "LISTEN_FDS": "1"}) is None
-    assert inherited_socket({"LISTEN_PID": str(os.getpid())}) is None
+    assert inherited_sockets({}) == {}
+    assert inherited_sockets({"LISTEN_PID": str(os.getpid() + 1), "LISTEN_FDS": "1"}) == {}
+    assert inherited_sockets({"LISTEN_PID": str(os.getpid())}) == {}
+
+
+def test_passed_sockets_are_ordered_by_the_names_of_their_units(tmp_path: Path) -> None:
+    """In a process of its own, whose first sockets have the numbers 3 to 5, as those of systemd, the page last.
+
+    The first listener runs the application's start and end. Without a certificate it is the only one.
+    """
+    authority = create_authority("eye", SystemClock())
+    (tmp_path / "authority.crt").write_bytes(authority[1])
+    (tmp_path / "server.pem").write_bytes(create_server_certificate(*authority[:2], "eye", SystemClock()))
+    code = """
+import os, socket, sys
+from pathlib import Path
+made = [socket.create_server((host, 0)) for host in ("0.0.0.0", "0.0.0.0", "127.0.0.1")]
+pairing, network, page = [one.getsockname()[1] for one in made]
+assert [one.detach() for one in made] == [3, 4, 5]
+from services.http.server import open_listeners
+names = (f"diffuscope{part}.socket" for part in ("-pairing", "-network", ""))
+given = {"LISTEN_PID": str(os.getpid()), "LISTEN_FDS": "3", "LISTEN_FDNAMES": ":".join(names)}
+tls = Path(sys.argv[1])
+found = open_listeners(given, "", 0, tls, 0)
+stated = [(one.socket.getsockname()[1], one.certificate, one.is_pairing) for one in found]
+assert stated == [(page, None, False), (network, tls / "server.pem", False), (pairing, None, True)], stated
+[one.socket.detach() for one in found]
+(tls / "server.pem").unlink()
+assert [one.socket.getsockname()[1] for one in open_listeners(given, "", 0, tls, 0)] == [page]
+"""
+    subprocess.run([sys.executable, "-c", code, tmp_path], cwd=ROOT, check=True)

@@ -22,7 +22,7 @@ from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics.matrix import chain_of, ring
 from device.values import ExposureSettings, Illumination
-from services.identity.users import FOLDER, UserTable
+from services.identity.setup_code import SetupCode
 from services.imaging.picture_files import read_raw_tiff
 from tests.ports.conftest import HEAD
 from tests.ports.emulators.wires import emulated_buses
@@ -102,7 +102,7 @@ def test_a_press_gives_a_simulated_picture_and_its_light_is_printed(tmp_path: Pa
     launched = Launched(tmp_path)
     try:
         launched.wait_until_ready()
-        code = UserTable(tmp_path / "data" / FOLDER).setup_code()
+        code = SetupCode(tmp_path / "data/tls", SystemClock()).create()
         user = {"name": "Asha", "secret": "274913", "code": code}
         launched.client.post("/api/setup", json=user).raise_for_status()  # real drivers have no demonstration user
         capture = launched.client.post("/api/captures", json={"eye": "OD"}).raise_for_status().json()

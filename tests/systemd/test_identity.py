@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from cryptography import x509
 
 from tests.project_files import ROOT
 from tests.systemd.machine import Machine, boot_tree, boot_until_power_cut, installed, root
 
 pytestmark = pytest.mark.systemd
 
-UNIT = "diffuscope-identity.service"
+UNIT, CERTIFICATE = "diffuscope-identity.service", "diffuscope-certificate.service"
 SHIPPED = {
     "fstab": "etc/fstab",
     "journald.conf": "etc/systemd/journald.conf.d/diffuscope.conf",
@@ -52,7 +53,10 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
     for name in ("captures", "compiled", "update", "journal"):
         (data / name).mkdir(parents=True)
     subprocess.run(["cp", "-al", root(), tree], check=True)
-    units = [(f"systemd/{UNIT}", f"etc/systemd/system/{UNIT}")]
+    units = [(f"systemd/{unit}", f"etc/systemd/system/{unit}") for unit in (UNIT, CERTIFICATE)]
+    units += [("systemd/diffuscope.sysusers", "etc/sysusers.d/diffuscope.conf")]
+    units += [("systemd/tls.tmpfiles", "etc/tmpfiles.d/diffuscope-tls.conf")]
+    units += [("systemd/image/address-change", "etc/NetworkManager/dispatcher.d/50-diffuscope")]
     for ours, theirs in [*units, *((f"systemd/image/{ours}", theirs) for ours, theirs in SHIPPED.items())]:
         words = [
             "install",
@@ -67,9 +71,12 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Board:
     wants = tree / "etc/systemd/system/sysinit.target.wants"
     wants.mkdir(exist_ok=True)
     (wants / UNIT).symlink_to(f"/etc/systemd/system/{UNIT}")
-    own = tree / f"etc/systemd/system/{UNIT}.d/python.conf"  # the Python of the tests is outside Debian's library path
-    own.parent.mkdir()
-    own.write_text("[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n")
+    (tree / "etc/NetworkManager/dispatcher.d/50-diffuscope").chmod(0o755)
+    subprocess.run(["systemd-sysusers", f"--root={tree}"], check=True)
+    for unit in (UNIT, CERTIFICATE):  # the Python of the tests is outside Debian's library path
+        own = tree / f"etc/systemd/system/{unit}.d/python.conf"
+        own.parent.mkdir()
+        own.write_text("[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n")
     return Board(tree, data, [f"--bind={data}:/data", *installed(opt)])
 
 
@@ -99,7 +106,6 @@ def check_identity_is_applied(machine: Machine, identity: dict[str, bytes]) -> N
     shown = machine.run("cat", "/run/issue.d/diffuscope.issue")
     assert f"password {identity['wifi'].decode()}\n" in shown
     assert len([line for line in shown.splitlines() if "█" in line or "▄" in line]) > 10, "no QR code"
-    assert machine.run("stat", "-c", "%a", "/run/diffuscope-identity/server.key").strip() == "600"
     assert identity["wifi"].decode() not in machine.run("journalctl", "--no-pager", "-o", "cat")
 
 
@@ -132,3 +138,23 @@ def test_networkmanager_and_avahi_accept_their_configuration(board: Board) -> No
         log = machine.run("journalctl", "-u", "avahi-daemon", "-o", "cat")
         assert "Host name is diffuscope.local" in log
         assert "diffuscope.service) successfully established" in log
+
+
+def addresses(pem: str) -> set[str]:
+    """Return the addresses that a certificate names."""
+    certificate = x509.load_pem_x509_certificate(pem.encode())
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    return {str(address) for address in names.get_values_for_type(x509.IPAddress)}
+
+
+def test_the_certificate_follows_an_address_and_only_its_group_reads_it(board: Board) -> None:
+    """The unit has no capability and no socket; the second address is set as DHCP would."""
+    with board.boots() as machine:
+        machine.run("systemctl", "start", CERTIFICATE)
+        server = "/run/diffuscope-tls/server.pem"
+        assert machine.run("stat", "-c", "%a %U %G", server).strip() == "640 root diffuscope-tls"
+        assert machine.run("stat", "-c", "%a", "/run/diffuscope-tls").strip() == "2750"
+        words = ["connection", "add", "type", "dummy", "ifname", "cable", "ip4", "192.168.77.5/24"]
+        machine.run("nmcli", *words)  # NetworkManager calls address-change
+        machine.until(lambda: "192.168.77.5" in addresses(machine.run("cat", server)))
+        assert "PRIVATE KEY" not in machine.run("cat", "/run/diffuscope-tls/authority.crt")

@@ -12,6 +12,9 @@ from device.values import FrameUse
 from services.archive.content import NAME_DIGITS, different_versions, result_name, software
 from services.archive.plan import Plan, PlanSettings, read_plan, write_plan
 from services.archive.planning import make_plan
+from services.archive.result import ResultFolder
+from services.archive.solve import CalibrationFiles, Solvers, Task, local_names
+from services.archive.stored_reports import earlier_figures
 from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_store import CaptureStore
 from tests.datasets import Scene, simulate_tiny
@@ -188,6 +191,34 @@ def test_frames_of_one_name_are_one_capture_in_every_kind_of_folder(scene: Scene
         assert [Path(frame.path).stem.rpartition("-")[2] for frame in frames] == ["1", "2", "red", "blue"]
         assert [frame.colour for frame in frames] == ["", "", "red", "blue"]
         assert [file.role for file in plan.calibrations[0].files] == ["psf", "psf-red"]
+
+
+def test_captures_of_a_store_are_solved_from_their_plain_content_and_erased_ones_are_not(
+    scene: Scene, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    kept = Archive(store / "calibrations" / "tiny-head")
+    id = kept.add_and_activate(
+        calibration(speckle(scene.raw.shape)), Provenance("D1", VirtualClock().wall(), "test", "0")
+    )
+    write_store(store, scene.raw, id, ("a", "b"))
+    plan, results = plan_of(store, settings=PlanSettings(method="tikhonov")), ResultFolder(tmp_path / "out")
+    results.prepare(plan)
+    files = CalibrationFiles(tmp_path / "calibrations")
+    (planned,) = plan.calibrations
+    named = zip(local_names(planned), planned.files, strict=True)
+    files.add(planned.digest, {name: Path(file.path).read_bytes() for (_, name), file in named})
+    first, second = (Task(capture, planned, plan.settings, plan.software) for capture in plan.captures)
+    before = {path: path.stat().st_mtime_ns for path in store.rglob("*")}
+    assert Solvers(files).solve(first, results, "worker").failure is None
+    assert earlier_figures(first.capture.report)["before_method"] == "none"
+    assert {path: path.stat().st_mtime_ns for path in store.rglob("*")} == before
+    with CaptureStore(store, reserve_bytes=0) as opened:
+        opened.keys.erase("")
+    failure = Solvers(files).solve(second, results, "worker").failure
+    assert failure is not None
+    assert "erased" in failure.reason
+    assert earlier_figures(second.capture.report) == {}
 
 
 def test_a_stored_burst_is_planned_whole_with_what_the_instrument_left_out(scene: Scene, tmp_path: Path) -> None:

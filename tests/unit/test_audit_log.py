@@ -11,7 +11,7 @@ from device.clock import VirtualClock
 from services import cli
 from services.errors import StoreDamaged
 from services.identity.audit_key import FILES, load_or_create_audit_key, read_audit_key
-from services.records.audit_log import HEAD, LOG, AuditLog
+from services.records.audit_log import HEAD, LOG, TAIL_BYTES, AuditFinding, AuditLog
 
 TRIALS = 1000
 KEY = bytes(range(32))
@@ -19,6 +19,7 @@ Damage = Callable[[Path, random.Random], None]
 
 
 def filled(folder: Path, entries: int = 30) -> AuditLog:
+    folder.mkdir(exist_ok=True)
     log = AuditLog(folder, KEY, VirtualClock())
     for number in range(entries):
         log.append(
@@ -70,7 +71,6 @@ DAMAGES: tuple[Damage, ...] = (edit, edit, leave_out, cut, swap, repeat, forge)
 
 
 def test_every_damage_of_a_thousand_is_found(tmp_path: Path) -> None:
-    (tmp_path / "whole").mkdir()
     whole = filled(tmp_path / "whole")
     assert whole.check().problem is None
     missed = []
@@ -94,6 +94,59 @@ def test_a_gap_stays_visible_after_further_entries(tmp_path: Path) -> None:
     later.append("Asha", "view", "visit-1")
     assert later.check().problem is not None
     assert later.entries(1)[0].number == 31
+
+
+def test_the_newest_entries_are_listed_and_checked_without_the_rest(tmp_path: Path) -> None:
+    log = filled(tmp_path, 60)
+    content = (tmp_path / LOG).read_bytes()
+    part = len(content) // 2
+    assert log.check(2 * part + 9) == log.check() == AuditFinding(60, None)
+    checked = log.check(part)
+    assert checked.problem is None
+    assert 25 < checked.entries < 31
+    lines = content.splitlines(keepends=True)
+    for number in (5, 50):
+        (tmp_path / LOG).write_bytes(b"".join(lines[:number]) + b"\n" + b"".join(lines[number:]))
+        assert log.check().entries == number
+        assert (log.check(part).problem is None) is (number == 5), "an early change is found by the whole check"
+
+
+def test_a_list_and_a_start_read_a_part_of_a_long_log(tmp_path: Path) -> None:
+    filled(tmp_path, 20)
+    line = (tmp_path / LOG).read_bytes().splitlines(keepends=True)[-1]
+    with open(tmp_path / LOG, "r+b") as file:
+        file.seek(3_000_000_000)  # a hole: more than may be read
+        file.write(b"\n" + line)
+    log = AuditLog(tmp_path, KEY, VirtualClock())
+    log.append("Asha", "sign-in")
+    assert [entry.number for entry in log.entries(3)] == [21, 20]
+    assert log.check(TAIL_BYTES) == AuditFinding(1, None)
+
+
+def test_archived_entries_are_in_the_file_and_the_chain_goes_on(tmp_path: Path) -> None:
+    log = filled(tmp_path / "store")
+    content = (tmp_path / "store" / LOG).read_bytes()
+    assert log.archive(tmp_path / "old") == 30
+    assert (tmp_path / "old").read_bytes() == content
+    for again in (log, AuditLog(tmp_path / "store", KEY, VirtualClock())):
+        again.append("Asha", "sign-in")
+        assert again.check().problem is None
+    assert [entry.number for entry in log.entries(9)] == [32, 31]
+    (tmp_path / "store" / LOG).write_bytes(content + (tmp_path / "store" / LOG).read_bytes())
+    assert log.check().problem is not None, "what is archived does not come back"
+    with pytest.raises(StoreDamaged, match="not as it was written"):
+        log.archive(tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_power_cut_while_entries_are_archived_loses_none(tmp_path: Path) -> None:
+    log = filled(tmp_path)
+    content = (tmp_path / LOG).read_bytes()
+    log.archive(tmp_path / "old")
+    (tmp_path / LOG).write_bytes(content)  # the head is written, and the log is as before
+    restarted = AuditLog(tmp_path, KEY, VirtualClock())
+    restarted.append("Asha", "sign-in")
+    assert restarted.check() == AuditFinding(1, None)
 
 
 def test_a_power_cut_between_an_entry_and_its_head_or_within_a_line_is_no_damage(tmp_path: Path) -> None:

@@ -151,6 +151,26 @@ def test_a_card_without_settings_boots_with_its_defaults_and_no_ssh(card: CardBo
     assert not (card.root / "run/NetworkManager").exists()
 
 
+@pytest.mark.parametrize(("settings", "own_wifi"), [("network = true\n", True), (f"network = true\n{GOOD}", False)])
+def test_the_network_is_served_only_where_the_settings_say_so(card: CardBoot, settings: str, own_wifi: bool) -> None:
+    """Sockets and avahi have the file as a condition; the access point is for a device that joins no Wi-Fi."""
+    written = card.root / "run/diffuscope-settings/network"
+    profile = card.root / "run/NetworkManager/system-connections/access-point.nmconnection"
+    for text_of_card, is_served in ((settings, True), ("", False)):
+        volatile(card)
+        profile.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / "systemd/image/access-point.nmconnection", profile)
+        write(card, text_of_card)
+        assert card.run() is None
+        assert written.exists() is is_served
+        assert ("autoconnect=true" in profile.read_text()) is (is_served and own_wifi)
+    for unit in ("diffuscope-network.socket", "diffuscope-pairing.socket", "image/avahi-condition.conf"):
+        assert f"ConditionPathExists=/{written.relative_to(card.root)}\n" in text(f"systemd/{unit}")
+    announced = re.findall(r"<type>(.*)</type>\s*<port>(.*)</port>", text("systemd/image/avahi.service"))
+    assert announced == [("_https._tcp", "443")]
+    assert "ListenStream=443\n" in text("systemd/diffuscope-network.socket")
+
+
 def test_every_example_of_the_template_is_valid(card: CardBoot) -> None:
     """The file on the card, with every mark # removed before a key or a table."""
     lines = text("systemd/image/card/diffuscope.toml").replace("AAAAC3Nza...", KEY.split()[1]).splitlines()

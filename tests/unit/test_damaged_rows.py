@@ -43,11 +43,10 @@ TABLES = {
     "visits": ("id", "patient", "day", "begun_at", "finished_at", "outcome"),
     "answers": ("visit", "name", "value"),
     "changes": ("visit", "at", "user", "field", "was", "value"),
-    "identifiers": ("patient", "name", "value"),
     "capture_slots": ("capture", "visit", "slot"),
     "slot_decisions": ("visit", "slot", "capture"),
     "uploads": ("visit", "finished_at", "failing_since", "error", "message"),
-    "patients": ("number",),
+    "patients": ("patient_id", "made_at", "identity"),
     "observed_time": ("boot",),
     "doses": ("eye",),
     "idempotency_keys": ("key", "answer", "done_at"),
@@ -71,7 +70,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
             visit = people.begin(next(keys)).id
             people.answer(next(keys), visit, "consent", "agreed", "Screener")
             people.answer(next(keys), visit, "complaints", ["flashes", "red"], "Screener")
-            people.answer(next(keys), visit, "name", f"Name{number}")
+            people.answer(next(keys), visit, "name", f"Name{number}", "Screener")
             target = people.pictures.capture_target("OD", next(keys), visit, "R-centre")
             report = CaptureReport.read(REPORT | {"visit": visit, "slot": "R-centre"})
             taken = Capture(f"c{number}", "OD", clock.wall(), True, "00ff", report, {})

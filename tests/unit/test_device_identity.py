@@ -18,7 +18,7 @@ from services.health.clock_source import clock_state
 from services.records.capture_store import CaptureStore
 from services.records.device_identity import DeviceIdentity, board_serial_number, load_or_create_device, read_device
 from services.records.numbering import automatic_number
-from services.records.patient_rows import patient_number
+from services.records.patient_rows import identity, patient_of_number
 from services.records.programme import load_programme
 from services.records.schema import CounterRow
 from services.records.visit_repository import VisitRepository
@@ -99,17 +99,17 @@ def test_a_programme_may_leave_the_letters_of_the_device_out() -> None:
 
 def test_a_number_of_an_earlier_release_is_found_with_and_without_its_prefix(tmp_path: Path) -> None:
     with CaptureStore(tmp_path) as store, Session(store.engine) as session:
-        known = patient_number(session, "A", None, "2026-03-02T12:00:00+00:00")
-        assert known == "A00013"
+        known = patient_of_number(session, "A", None, "2026-03-02T12:00:00+00:00")
+        assert identity(session, known) == ("A00013", {})
         assert session.get(CounterRow, "A") is not None
         for typed in ("A00013", "00013"):
-            assert patient_number(session, "AKFTRW", typed, "2026-03-03T12:00:00+00:00") == known
-        first = patient_number(session, "AKFTRW", None, "2026-03-03T12:00:00+00:00")
-        assert first == "AKFTRW00013"
-        assert patient_number(session, "AKFTRW", "00013", "2026-03-03T12:00:00+00:00") == first
+            assert patient_of_number(session, "AKFTRW", typed, "2026-03-03T12:00:00+00:00") == known
+        first = patient_of_number(session, "AKFTRW", None, "2026-03-03T12:00:00+00:00")
+        assert identity(session, first) == ("AKFTRW00013", {})
+        assert patient_of_number(session, "AKFTRW", "00013", "2026-03-03T12:00:00+00:00") == first
         for typed in ("A00014", "AKFTRW00014"):
             with pytest.raises(ValueError, match="mistyped"):
-                patient_number(session, "AKFTRW", typed, "2026-03-03T12:00:00+00:00")
+                patient_of_number(session, "AKFTRW", typed, "2026-03-03T12:00:00+00:00")
 
 
 def test_an_export_without_a_picture_names_its_device(tmp_path: Path) -> None:

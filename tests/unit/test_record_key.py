@@ -11,6 +11,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.light_safety.dose_ledger import DoseLedgerState
+from services.errors import StoreDamaged
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import LOG, DoseLedgerLog
@@ -94,8 +95,10 @@ def test_a_removed_or_changed_note_of_the_key_makes_no_file_new(
 
 
 @pytest.mark.parametrize("without_database", [False, True])
-def test_a_new_key_costs_no_record(tmp_path: Path, visit: str, without_database: bool) -> None:
-    """A copy of a store without its key takes its files as they are, once, and writes all of them with its own."""
+def test_a_copy_without_its_key_keeps_its_records_and_tells_no_patient(
+    tmp_path: Path, visit: str, without_database: bool
+) -> None:
+    """It takes its files as they are, once, and writes all of them with its own key; the patients stay encrypted."""
     with CaptureStore(tmp_path, reserve_bytes=0, key=KEY) as store:
         store.save(
             Capture("kept", "OD", VirtualClock().wall(), True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"}
@@ -104,9 +107,12 @@ def test_a_new_key_costs_no_record(tmp_path: Path, visit: str, without_database:
         (tmp_path / DATABASE).unlink()
     for _ in range(2):
         with CaptureStore(tmp_path, reserve_bytes=0, key=KEY[::-1]) as store:
-            assert visits_of(store).get(visit).fields["vision_od"] == "6/60"
+            assert (visits_of(store).visits(10), visits_of(store).damaged()) == ([], 1)
+            with pytest.raises(StoreDamaged, match="key"):
+                visits_of(store).get(visit)
             assert [capture.id for capture in store.captures()] == ["kept"]
-        assert RecordFiles(tmp_path, KEY[::-1]).read("capture", "kept") is not None
+        for kind, id in (("capture", "kept"), ("visit", visit)):
+            assert RecordFiles(tmp_path, KEY[::-1]).read(kind, id) is not None
         (tmp_path / DATABASE).unlink()
 
 

@@ -18,6 +18,8 @@ from services.errors import StoreDamaged
 from services.records import schema
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
+from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import PatientIndex
 from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_document import RecordDocument, parse_document
@@ -307,11 +309,13 @@ def test_a_number_that_was_given_again_in_older_tables_mixes_up_no_patients(
         people.answer(next(KEYS), visit, "age", 30)
     snapshots.restore(snapshots.names()[0])
     now = "'2026-03-01T18:00:00.000000+00:00'"
+    usha, index = "0" * 16, PatientIndex(PatientKeys(tmp_path, None))
+    index.keys.create(usha)
+    identity = index.encrypted(usha, {"number": number, "name": "Usha"})
     without_rows(  # the number is given to another patient
         tmp_path,
-        f"INSERT INTO patients (number, made_at, patient_id) VALUES ('{number}', {now}, '{'0' * 16}')",
-        f"INSERT INTO identifiers (patient, name, value) VALUES ('{number}', 'name', '\"Usha\"')",
-        f"INSERT INTO visits (id, patient, day, begun_at) VALUES ('v1', '{number}', '2026-03-01', {now})",
+        f"INSERT INTO patients (patient_id, made_at, identity) VALUES ('{usha}', {now}, '{identity}')",
+        f"INSERT INTO visits (id, patient, day, begun_at) VALUES ('v1', '{usha}', '2026-03-01', {now})",
         f"INSERT INTO answers (visit, name, value, set_at) VALUES ('v1', 'age', '51', {now})",
     )
     for _ in range(2):
@@ -322,7 +326,8 @@ def test_a_number_that_was_given_again_in_older_tables_mixes_up_no_patients(
                 for stored_visit in people.visits(10)
             }
             assert found == {"v1": (number, "Usha", 51), visit: (other, "Asha", 30)}
-    assert sorted(document.content["number"] for document in documents(tmp_path)) == sorted([number, other])
+    in_files = [index.identity(document.id, document.content["identity"]) for document in documents(tmp_path)]
+    assert sorted(in_files) == sorted([(number, {"name": "Usha"}), (other, {"name": "Asha"})])
 
 
 def documents(folder: Path) -> list[RecordDocument]:

@@ -35,7 +35,7 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
 
 
 def visit(finished_at: datetime | None) -> Visit:
-    return Visit("v", "A1", "2026-03-01", NOON, {}, {}, finished_at)
+    return Visit("v", "p", "A1", "2026-03-01", NOON, {}, {}, finished_at)
 
 
 @pytest.mark.parametrize(

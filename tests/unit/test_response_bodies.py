@@ -67,7 +67,7 @@ def test_values_that_are_not_known_have_no_key() -> None:
 
 def test_a_visit_with_an_impossible_answer_is_damaged(tmp_path: Path) -> None:
     slots = {slot.id: SlotState() for slot in load_programme().slots}
-    visit = Visit("v1", "A1", "2026-03-01", datetime(2026, 3, 1, tzinfo=UTC), {"age": {"years": 1}}, slots)
+    visit = Visit("v1", "p1", "A1", "2026-03-01", datetime(2026, 3, 1, tzinfo=UTC), {"age": {"years": 1}}, slots)
     with CaptureStore(tmp_path, reserve_bytes=0) as store, pytest.raises(StoreDamaged, match="v1"):
         visit_answer(visit, VisitRepository(store.engine, load_programme(), VirtualClock()))
 

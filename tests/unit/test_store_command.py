@@ -14,7 +14,15 @@ from services.errors import RecordNotFound, StoreDamaged
 from services.records.capture_store import CaptureStore
 from tests.store_damage import Shown, expected, filled_store, shown
 
-CHECKED = ("database", "copy of the dose ledger", "patients", "visits", "captures", "files of captures")
+CHECKED = (
+    "database",
+    "copy of the dose ledger",
+    "patients",
+    "visits",
+    "captures",
+    "keys of patients",
+    "files of captures",
+)
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from services import cli
 from services.errors import ConfirmationRequired, LoginRequired, RecordNotFound, StoreDamaged
 from services.identity.lock_out import MAX_OWN_SCREEN_WAIT_S, MAX_WAIT_S, LockOut
 from services.identity.logins import CONFIRMED_S, IDLE_LOCK_S, MAX_LOGIN_S, MAX_LOGINS, Logins
+from services.identity.setup_code import SetupCode
 from services.identity.users import UserTable
 
 PIN, PASSPHRASE = "274913", "a blue boat in May"
@@ -95,25 +96,38 @@ def test_a_damaged_table_admits_nobody_and_opens_no_set_up(users: UserTable, tmp
         file.write_bytes(content[: len(content) // 2] if damage == "half" else content)
     for table in (users, UserTable(tmp_path / "access")):
         assert table.has_begun
-        assert table.setup_code() is None
         with pytest.raises(StoreDamaged):
             table.verify("Asha", PIN)
         with pytest.raises(StoreDamaged):
             table.add("Eve", PIN, ["administrator"])
 
 
-def test_the_set_up_code_is_private_stays_and_ends_with_the_first_user(tmp_path: Path) -> None:
-    table = UserTable(tmp_path / "access")
-    code = table.setup_code()
-    assert code is not None
-    assert UserTable(tmp_path / "access").setup_code() == code
-    assert stat.S_IMODE((tmp_path / "access/setup-code").stat().st_mode) == 0o600
-    assert table.is_setup_code(f" {code[:4].lower()}-{code[4:]} ")
-    assert not table.is_setup_code(code[:-1])
-    assert not table.is_setup_code("")
-    table.add("Asha", PIN, ["administrator"])
-    assert not table.is_setup_code(code)
-    assert not (tmp_path / "access/setup-code").exists()
+def test_a_set_up_code_is_valid_for_two_minutes_in_any_spelling(tmp_path: Path, clock: VirtualClock) -> None:
+    page, label = SetupCode(tmp_path / "tls", clock), SetupCode(tmp_path / "tls", clock)
+    assert not page.is_valid("")
+    code = label.create()
+    assert stat.S_IMODE((tmp_path / "tls/setup-code").stat().st_mode) == 0o640
+    clock.sleep(119.0)
+    assert page.is_valid(f" {code[:4].lower()}-{code[4:]} ")
+    assert not page.is_valid(code[:-1])
+    assert not page.is_valid("")
+    clock.sleep(1.0)
+    assert not page.is_valid(code)
+    newer = label.create()
+    assert page.is_valid(newer)
+    assert not page.is_valid(code)
+
+
+def test_a_set_up_code_ends_with_the_fifth_wrong_try_and_with_the_boot(tmp_path: Path, clock: VirtualClock) -> None:
+    codes = SetupCode(tmp_path, clock)
+    code = codes.create()
+    assert [codes.is_valid(wrong) for wrong in ("AAAAAAAA", "", "1", code[:-1])] == [False] * 4
+    assert codes.is_valid(code)
+    assert not codes.is_valid("BBBBBBBB")
+    assert not codes.is_valid(code)
+    assert codes.is_valid(codes.create())
+    (tmp_path / "setup-code").write_text(f"{code} another-boot {clock.now_s()}")
+    assert not codes.is_valid(code)
 
 
 def test_each_wrong_attempt_doubles_the_wait_of_account_and_address(tmp_path: Path, clock: VirtualClock) -> None:
@@ -234,7 +248,7 @@ def test_the_command_adds_lists_and_resets(tmp_path: Path, capsys: pytest.Captur
         shown = capsys.readouterr()
         return ended.value.code, shown.out + shown.err
 
-    assert "set-up code" in run("list")[1]
+    assert "`diffuscope label`" in run("list")[1]
     assert run("add", "Asha", "--role", "reader", "--secret-file", str(secret))[0] == 2
     assert run("add", "Asha", "--role", "pilot", "--secret-file", str(secret))[0] == 2
     assert run("add", "Asha", "--role", "administrator", "--secret-file", str(secret))[0] == 0

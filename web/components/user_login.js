@@ -15,6 +15,7 @@ const REQUESTS = {
   "access.confirm": ["POST", "/api/login/confirm"],
   own: ["PUT", "/api/login/secret"],
 };
+const CODE_OF_LABEL = new URLSearchParams(location.hash.slice(1)).get("code") ?? ""; // before the router replaces it
 const HAS_CANCEL = ["access.confirm", "own"];
 
 class UserLogin extends HTMLElement {
@@ -98,7 +99,7 @@ function view({ code, name, error, busy }, actions) {
   return html`<dialog class="login" aria-labelledby="login-title" @cancel=${actions.cancel}>
     <form @submit=${actions.submit} autocomplete="off">
       <h2 id="login-title">${icon("person")} ${t(TITLES[code] ?? "login.title")}</h2>
-      ${isSetup ? html`<p>${t("login.setup.why")}</p>${field("code", t("login.code"))}` : nothing}
+      ${isSetup ? html`<p>${t("login.setup.why")}</p>${field("code", t("login.code"), "text", CODE_OF_LABEL)}` : nothing}
       ${hasCancel ? nothing : names(name, isSetup ? [] : knownNames(), actions)}
       ${field("secret", t(isSetup ? "login.new" : isOwn ? "login.old" : "login.pin"), "password")}
       ${isOwn ? field("new", t("login.new"), "password") : nothing}
@@ -121,5 +122,5 @@ function names(name, known, actions) {
   `;
 }
 
-const field = (name, label, type = "text") =>
-  html`<label>${label} <input name=${name} type=${type} maxlength="200" required autocomplete="off" /></label>`;
+const field = (name, label, type = "text", value = "") =>
+  html`<label>${label} <input name=${name} type=${type} value=${value} maxlength="200" required autocomplete="off" /></label>`;

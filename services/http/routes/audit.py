@@ -4,7 +4,7 @@ from fastapi import APIRouter, Query
 
 from services.errors import RecordNotFound
 from services.http.schemas.audit import AuditAnswer, AuditEntryAnswer
-from services.records.audit_log import AuditLog
+from services.records.audit_log import NEWEST_BYTES, AuditLog
 
 
 def audit_router(audit_log: AuditLog | None) -> APIRouter:
@@ -18,13 +18,14 @@ def audit_router(audit_log: AuditLog | None) -> APIRouter:
         action: str = Query("", max_length=40),
         record: str = Query("", max_length=128),
     ) -> AuditAnswer:
-        """Return the newest entries of the audit log, the newest first, of one user, action or record, and its check.
+        """Return the newest entries of the audit log, the newest first, of one user, action or record, and their check.
 
-        404 if this device keeps no audit log.
+        Entries and check are of the last NEWEST_BYTES (4 MB); `diffuscope audit verify` checks the whole log. 404 if
+        this device keeps no audit log.
         """
         if audit_log is None:
             raise RecordNotFound("no audit log is kept", "Look at the event log for the reason.")
-        found, newest = audit_log.check(), audit_log.entries(limit, user, action, record)
+        found, newest = audit_log.check(NEWEST_BYTES), audit_log.entries(limit, user, action, record)
         shown = [AuditEntryAnswer.model_validate(entry) for entry in newest]
         return AuditAnswer(entries=shown, count=found.entries, problem=found.problem)
 

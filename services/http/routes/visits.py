@@ -107,7 +107,7 @@ def _form_router(repository: VisitRepository) -> APIRouter:
         Answers 201 with the visit; 422 for an invalid number, or an automatic number with a wrong check digit.
         """
         visit = repository.begin(order.key, order.number)
-        request.state.audit_record = visit.id
+        request.state.audit_record, request.state.audit_patient = visit.id, visit.patient_id
         return visit_answer(visit, repository)
 
     @router.patch("/api/visits/{id}")
@@ -117,9 +117,9 @@ def _form_router(repository: VisitRepository) -> APIRouter:
         404 for an unknown visit, 409 for a finished one, 422 for an unknown field or an invalid value.
         """
         request.state.audit_field = order.field
-        return visit_answer(
-            repository.answer(order.key, id, order.field, order.value, signed_in(request).name), repository
-        )
+        visit = repository.answer(order.key, id, order.field, order.value, signed_in(request).name)
+        request.state.audit_patient = visit.patient_id
+        return visit_answer(visit, repository)
 
     return router
 

@@ -15,7 +15,7 @@ class AuditEntryAnswer(ResponseBody):
 
 
 class AuditAnswer(ResponseBody):
-    """Entries, the number of valid ones in the whole log, and what its check found; null if it is as written."""
+    """Entries, the number of valid ones in the part that was checked, and its problem; null without one."""
 
     entries: list[AuditEntryAnswer]
     count: int
