@@ -90,6 +90,8 @@ ACCESS: dict[str, Access] = {
     "POST /api/visits/{id}/reopen": EXAM,
     "GET /api/visits/{id}/montage/{eye}": READ,
     "GET /api/visits/{id}/montage/{eye}/picture.png": READ,
+    "GET /api/patients": USERS,
+    "POST /api/patients/erase": USERS,
     "GET /api/exports": READ,
     "POST /api/visits/{id}/export": READ,
     "GET /api/visits/{id}/export.zip": READ,

@@ -51,6 +51,8 @@ ACTIONS = {
     "POST /api/visits/{id}/not-possible": "not-possible",
     "POST /api/visits/{id}/finish": "finish",
     "POST /api/visits/{id}/reopen": "reopen",
+    "GET /api/patients": "find-patient",
+    "POST /api/patients/erase": "erase-patient",
     "POST /api/captures": "capture",
     "GET /api/captures": LIST_PICTURES,
     "GET /api/captures/{id}": VIEW,

@@ -42,6 +42,7 @@ from services.http.log_rate import LOGGER_NAMES, LogRateLimit
 from services.http.pairing import pairing_app
 from services.http.routes.accuracy import accuracy_routes
 from services.http.routes.backup import backup_routes
+from services.http.routes.erasure import erasure_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
@@ -220,6 +221,7 @@ def serve(
             update_routes(UpdateRequests(*updater, clock, version("diffuscope"))),
             event_log_routes(event_log, UsbDrives(), clock),
             backup_routes(backups, store, UsbDrives(), clock),
+            erasure_routes(arbiter, backups),
         ]
         authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, listeners), store.refusal, tls)
         app = create_app(

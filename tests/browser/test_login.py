@@ -1,5 +1,7 @@
-"""Set-up, sign-in, lock and users on the page: by keyboard, without accessibility faults, over the kept state."""
+"""Set-up, sign-in, lock, users, erasure: by keyboard, without accessibility faults, over the kept state."""
 
+import json
+import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -125,3 +127,39 @@ def test_a_new_device_is_set_up_with_its_code(own_server: Server, open_page: Ope
     expect(dialog).to_be_hidden(timeout=20_000)
     page.locator("#open-menu").tap()
     expect(page.locator("#menu")).to_contain_text("Signed in: Asha")
+
+
+def test_an_administrator_erases_a_patient_and_stores_the_receipt(
+    own_server: Server, open_page: Open, complaints: Complaints
+) -> None:
+    complaints.expect("401", "403", "404")
+    body = json.dumps({"key": "1" * 16, "number": "ZQ-77120"}).encode()
+    begin = urllib.request.Request(f"{own_server.url}/api/visits", body, {"Content-Type": "application/json"})
+    assert urllib.request.urlopen(begin, timeout=30).status == 201
+    UserTable(own_server.data / FOLDER).add("Asha", PIN, ["administrator", "technician"])
+    page = open_page(f"{own_server.url}/technician")
+    sign_in(page, "Asha")
+    page.locator("[data-section=erase]").tap()
+    erasure = page.locator("patient-erasure")
+    for number in ("ZQ-1", "zq-77120"):
+        erasure.locator("[name=number]").fill(number)
+        page.wait_for_timeout(PRESS_MS)
+        page.keyboard.press("Enter")
+        expect(erasure).to_contain_text("No patient has this number" if number == "ZQ-1" else "Visits: 1.")
+    expect(erasure.locator("[role=alert]")).to_have_count(0)
+    erasure.locator("[name=again]").fill("ZQ-77121")
+    erasure.locator("[value=withdrawn]").check()
+    page.wait_for_timeout(PRESS_MS)
+    page.keyboard.press("Enter")
+    expect(erasure.locator("[role=alert]")).to_contain_text("differ")
+    assert faults(page) == []
+    erasure.locator("[name=again]").fill("zq-77120")
+    page.wait_for_timeout(PRESS_MS)
+    page.keyboard.press("Enter")
+    expect(erasure.locator("[role=status]")).to_contain_text("was erased")
+    assert faults(page) == []
+    with page.expect_download() as stored:
+        page.wait_for_timeout(PRESS_MS)
+        erasure.locator("#receipt").tap()
+    receipt = json.loads(stored.value.path().read_bytes())
+    assert (receipt["reason"], receipt["visits"]) == ("withdrawn", 1)

@@ -34,6 +34,7 @@ from services.http.app import Application, create_app
 from services.http.authentication import Authenticator
 from services.http.routes.accuracy import accuracy_routes
 from services.http.routes.backup import backup_routes
+from services.http.routes.erasure import erasure_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.instrument.accuracy_explorer import AccuracyExplorer
@@ -250,6 +251,7 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
             update_routes(desk),
             event_log_routes(event_log, sticks, clock),
             backup_routes(backups, store, sticks, clock),
+            erasure_routes(owner, backups),
         ]
         application = create_app(
             owner,

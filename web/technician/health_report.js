@@ -16,10 +16,10 @@ export function copyText(area) {
 }
 
 /** Offer a text as a file to download. */
-export function save(text) {
+export function save(text, name = "health.txt") {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([text], { type: "text/plain" }));
-  link.download = "health.txt";
+  link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }

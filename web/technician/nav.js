@@ -4,6 +4,7 @@ import "./event_log.js";
 import "./accuracy_time.js";
 import "./audit.js";
 import "./backup.js";
+import "./erasure.js";
 import "./health.js";
 import "./software_update.js";
 import "./stored_pictures.js";
@@ -19,6 +20,7 @@ const SECTIONS = {
   backup: html`<instrument-backup class="column"></instrument-backup>`,
   space: html`<stored-pictures class="column"></stored-pictures>`,
   users: html`<instrument-users class="column"></instrument-users>`,
+  erase: html`<patient-erasure class="column"></patient-erasure>`,
   audit: html`<instrument-audit class="column"></instrument-audit>`,
   update: html`<software-update class="column"></software-update>`,
 };
