@@ -76,9 +76,8 @@ def identity(session: Session, id: str) -> tuple[str, dict[str, JsonValue]]:
 def set_field(session: Session, id: str, name: str, value: FormValue) -> JsonValue:
     """Set an identifying field of a patient, None to remove it; return its value before. Errors as in `identity`."""
     number, fields = identity(session, id)
-    kept: dict[str, object] = {NUMBER: number, **fields, name: value}
-    row = session.get_one(PatientRow, id)
-    row.identity = index_of(session).encrypted(id, {key: known for key, known in kept.items() if known is not None})
+    kept = {key: known for key, known in {NUMBER: number, **fields, name: value}.items() if known is not None}
+    session.get_one(PatientRow, id).identity = index_of(session).encrypted(id, kept)
     return fields.get(name)
 
 
