@@ -251,7 +251,7 @@ def access() -> list[dict[str, Any]]:
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         (device.folder / "access").mkdir()
-        (device.folder / "access" / FILE).write_text(f"{CODE} {boot_id()} 0")  # otherwise a random one
+        (device.folder / "access" / FILE).write_text(f"{CODE} {boot_id()} inf")  # otherwise a random one
         log.ask("GET /api/login", note="the demonstration user")
         log.ask("POST /api/login", json=ASHA, note="no user exists yet")
         log.ask("POST /api/setup", json=ASHA | {"code": "AAAAAAAA"})
