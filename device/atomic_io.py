@@ -126,6 +126,15 @@ def write_atomically(path: Path, content: bytes, mode: int | None = PRIVATE_FILE
     fsync_folder(path.parent)
 
 
+def overwrite(path: Path, content: bytes, at_byte: int = 0) -> None:
+    """Overwrite a part of a file in place, durably: no older file with the replaced content stays on the disk."""
+    with open(path, "r+b") as file:
+        file.seek(at_byte)
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def write_atomically_unsynced(path: Path, content: bytes) -> None:
     """Write or replace a private file atomically for other processes; a power cut may leave it incomplete."""
     part = path.with_name(f".{path.name}.part")

@@ -8,7 +8,7 @@
         backups/<number>.age    one backup: everything else in the store, and the list of its objects
         patient-keys.age        keys of the patients, replaced by each backup; patient-keys-copy.age is the same
 
-The keys are overwritten in place, so that all backups lose the pictures and the name of a patient who was erased.
+The keys are overwritten in place: an erased patient is erased in all backups.
 An object is named by the SHA-256 of its encrypted content, so that a copy can be checked without a key. A line of the
 index is written after its object is durable, a backup after all of its objects: a backup that was interrupted leaves
 the earlier ones complete, and the next one continues.
@@ -102,13 +102,7 @@ class BackupFolder:
         """Overwrite the keys of the patients durably, one copy after the other, and read them back."""
         with drive_errors(self.folder):
             for name in PATIENT_KEYS:
-                path = self.folder / name
-                with open(path, "r+b" if path.exists() else "wb", opener=atomic_io.private_opener) as file:
-                    file.write(encrypted)
-                    file.truncate()
-                atomic_io.fsync_file(path)
-                atomic_io.fsync_folder(self.folder)
-                _refuse_changed(path, encrypted)
+                _write_and_read_back(self.folder / name, encrypted, in_place=True)
 
     def _write_header(self, header: BackupHeader) -> None:
         """Write each copy of the header that is missing or unreadable; BackupDamaged if one is of other backups."""
@@ -194,18 +188,17 @@ def find_folder(place: Path) -> Path:
     return found[0]
 
 
-def _write_and_read_back(path: Path, content: bytes) -> None:
+def _write_and_read_back(path: Path, content: bytes, in_place: bool = False) -> None:
     """Write a file durably and compare what the disk, and not the page cache, returns; BackupDamaged if it differs.
 
     Under its own name at once: SHA-256 or age reveal an incomplete file, and on FAT a power cut within a rename can
     damage a complete one.
     """
-    path.unlink(missing_ok=True)  # incomplete, or changed
-    atomic_io.write_file(path, content)
+    if in_place and path.exists():
+        atomic_io.overwrite(path, content)
+    else:
+        path.unlink(missing_ok=True)  # incomplete, or changed
+        atomic_io.write_file(path, content)
     atomic_io.fsync_folder(path.parent)
-    _refuse_changed(path, content)
-
-
-def _refuse_changed(path: Path, content: bytes) -> None:
     if atomic_io.read_from_disk(path) != content:
         raise BackupDamaged(f"{path} cannot be read back as it was written")

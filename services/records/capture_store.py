@@ -55,8 +55,8 @@ from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.capture_versions import CaptureVersions
 from services.records.earlier_stores import refuse_earlier_store
-from services.records.patient_index import use_keys
 from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import PatientIndex
 from services.records.quarantine import Quarantine
 from services.records.record_document import RecordDocument
 from services.records.record_files import CAPTURE_RECORD, RecordFiles
@@ -86,8 +86,7 @@ class CaptureStore:
     ledger: nothing is restored from one that another program wrote; None checks none. It also wraps `keys`, those of
     the patients. `quarantine`, `versions`, `space` and `write_ahead_log` are the parts of the store for those matters.
     Several threads may read while one writes; a lock file serialises writers across threads and processes. Opening and
-    closing checkpoint the write-ahead log.
-    Errors at opening: StoreError, StoreFull, StoreDamaged.
+    closing checkpoint the write-ahead log. Errors at opening: StoreError, StoreFull, StoreDamaged.
     """
 
     newly_quarantined: tuple[str, ...]
@@ -125,7 +124,7 @@ class CaptureStore:
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
                 self.keys = PatientKeys(folder, key)
-                use_keys(self.engine, self.keys)
+                self.engine.update_execution_options(patients=PatientIndex(self.keys))
                 self.versions = CaptureVersions(self._captures, self._lock, self.engine, self.keys)
                 damage = self._set_damaged_database_aside()
                 schema.make_private(database)

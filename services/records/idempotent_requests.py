@@ -82,10 +82,7 @@ class IdempotentRequests:
         session.execute(delete(IdempotencyKeyRow).where(IdempotencyKeyRow.done_at < oldest))
 
     def _digest(self, request: str) -> str:
-        """Return the HMAC-SHA-256 (hexadecimal) of the text of a request, which may hold a patient number.
-
-        A repeat can be compared without storing the text, and without the store's key no text can be guessed.
-        """
+        """Return the HMAC of the text of a request, which may hold a number: a plain digest could be guessed."""
         return hmac.new(self._key, request.encode("utf-8", "backslashreplace"), hashlib.sha256).hexdigest()
 
 

@@ -1,21 +1,93 @@
-"""Rows of patients: by number or visit, the encrypted identity, and the counter of automatic numbers."""
+"""Rows of patients: encrypted values, a patient by number or visit, and the counter of automatic numbers."""
 
+import base64
+import json
 import secrets
 from collections.abc import Collection
+from contextlib import suppress
+from functools import cache
 
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
 
 from device.errors import InputError, StoreError
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import numbering
-from services.records.json_values import FormValue, JsonObject, JsonValue
-from services.records.patient_index import NUMBER, index_of
-from services.records.row_validation import REMEDY
+from services.records import numbering, row_validation
+from services.records.json_values import FormValue, JsonValue
+from services.records.patient_keys import PatientKeys
+from services.records.record_document import as_object
+from services.records.row_validation import REMEDY, reading_record
 from services.records.schema import CounterRow, PatientRow, VisitRow
 from services.records.storage_errors import storage_errors
 
-MAX_OF_ONE_NUMBER = 99  # patients that got the same number after restorations of older tables
+NUMBER = "number"  # entry of the identity beside the identifying fields of `answers.IDENTIFIERS`
+ENDINGS = ("", *(f"-{count}" for count in range(2, 100)))  # of patients who got one number after restorations
+
+
+class PatientIndex:
+    """Encrypts values of patients under their keys, and finds numbers, which SQL cannot search; thread-safe."""
+
+    def __init__(self, keys: PatientKeys) -> None:
+        self.keys = keys
+        self._number = cache(self._read_number)  # by patient id and encrypted identity
+
+    def encrypted(self, patient_id: str, value: object) -> str:
+        """Return a value of JSON as encrypted text (base64); RecordErased or StoreDamaged without the patient's key."""
+        return base64.b64encode(self.keys.encrypt(patient_id, json.dumps(value).encode(), "row")).decode()
+
+    def decrypted(self, patient_id: str, stored: object) -> JsonValue:
+        """Return the value of such a text; RecordErased, or StoreDamaged if it or the key is damaged."""
+        with reading_record(patient_id):
+            content = base64.b64decode(row_validation.text(stored), validate=True)
+            return row_validation.parsed_json(self.keys.decrypt(patient_id, content, "row").decode())
+
+    def identity(self, patient_id: str, stored: object) -> tuple[str, dict[str, JsonValue]]:
+        """Return number and identifying fields of a patient from the column `identity`; errors as in `decrypted`."""
+        with reading_record(patient_id):
+            values = as_object(self.decrypted(patient_id, stored))
+            fields = {name: value for name, value in values.items() if name != NUMBER}
+            return row_validation.text(values[NUMBER]), fields
+
+    def numbers(self, session: Session) -> dict[str, str]:
+        """Return the readable numbers by patient id; only identities that are new, of any process, are decrypted."""
+        rows = session.execute(select(PatientRow.patient_id, PatientRow.identity)).all()
+        return {id: number for id, identity in rows if (number := self._number(id, identity)) is not None}
+
+    def _read_number(self, patient_id: str, identity: str) -> str | None:
+        with suppress(StoreError):
+            return self.identity(patient_id, identity)[0]
+        return None
+
+
+def index_of(session: Session) -> PatientIndex:
+    """Return the index of the store whose tables a session reads, which `CaptureStore` gives to its engine."""
+    index: PatientIndex = session.get_bind().get_execution_options()["patients"]
+    return index
+
+
+def identity(session: Session, id: str) -> tuple[str, dict[str, JsonValue]]:
+    """Return number and identifying fields of a patient; RecordErased, StoreDamaged (also without a row)."""
+    row = session.get(PatientRow, id)
+    if row is None:
+        raise StoreDamaged("the entry of a patient is missing", REMEDY)
+    return index_of(session).identity(id, row.identity)
+
+
+def set_field(session: Session, id: str, name: str, value: FormValue) -> JsonValue:
+    """Set an identifying field of a patient, None to remove it; return its value before. Errors as in `identity`."""
+    number, fields = identity(session, id)
+    kept: dict[str, object] = {NUMBER: number, **fields, name: value}
+    row = session.get_one(PatientRow, id)
+    row.identity = index_of(session).encrypted(id, {key: known for key, known in kept.items() if known is not None})
+    return fields.get(name)
+
+
+def add_patient(session: Session, id: str, number: str, made_at: str) -> None:
+    """Add a patient with a key; RecordErased if a patient with this id was erased."""
+    index = index_of(session)
+    index.keys.create(id)
+    session.add(PatientRow(patient_id=id, made_at=made_at, identity=index.encrypted(id, {NUMBER: number})))
+    session.flush()
 
 
 def patient_of_number(session: Session, prefix: str, number: str | None, made_at: str) -> str:
@@ -34,61 +106,28 @@ def patient_of_number(session: Session, prefix: str, number: str | None, made_at
         if with_prefix is None and any(_is_mistyped(start, number) for start in prefixes):
             raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
         number = with_prefix or number
-    if number in known:
-        return known[number]
-    id = secrets.token_hex(8)
-    add_patient(session, id, number, made_at)
-    return id
-
-
-def add_patient(session: Session, id: str, number: str, made_at: str) -> None:
-    """Add a patient with a key; RecordErased if a patient with this id was erased."""
-    index = index_of(session)
-    index.keys.create(id)
-    session.add(PatientRow(patient_id=id, made_at=made_at, identity=index.encrypted(id, {NUMBER: number})))
-    session.flush()
-
-
-def identity(session: Session, id: str) -> tuple[str, JsonObject]:
-    """Return number and identifying fields of a patient.
-
-    RecordErased, or StoreDamaged if the patient has no row, or row or key are damaged.
-    """
-    row = session.get(PatientRow, id)
-    if row is None:
-        raise StoreDamaged(f"the entry of the patient {id!a} is missing", REMEDY)
-    return index_of(session).identity(id, row.identity)
-
-
-def set_field(session: Session, id: str, name: str, value: FormValue) -> JsonValue:
-    """Set an identifying field of a patient, None to remove it; return its value before. Errors as in `identity`."""
-    number, fields = identity(session, id)
-    kept: dict[str, object] = {NUMBER: number, **fields, name: value}
-    row = session.get_one(PatientRow, id)
-    row.identity = index_of(session).encrypted(id, {key: known for key, known in kept.items() if known is not None})
-    return fields.get(name)
+    if number not in known:
+        known[number] = secrets.token_hex(8)
+        add_patient(session, known[number], number, made_at)
+    return known[number]
 
 
 def give_free_number(session: Session, row: PatientRow) -> bool:
     """Give a patient whose row is restored a free number; return whether the number could stay.
 
-    If another patient has it, as after the restoration of older tables, it gets the first free of the endings "-2",
-    "-3", ...: two patients are never mixed up. An identity that cannot be decrypted stays as it is.
+    If another patient has it, as after the restoration of older tables, it gets the first free of ENDINGS: two patients
+    are never mixed up. An identity that cannot be decrypted stays as it is.
     """
     index, id = index_of(session), row.patient_id
-    taken: dict[str, str] = session.info.get("taken") or {
-        number: known for known, number in index.numbers(session).items()
-    }
-    session.info["taken"] = taken  # read once in a transaction, which holds the write lock
+    if "taken" not in session.info:  # read once in a transaction, which holds the write lock
+        session.info["taken"] = {number: known for known, number in index.numbers(session).items()}
+    taken: dict[str, str] = session.info["taken"]
     try:
         described, fields = index.identity(id, row.identity)
     except StoreError:
         return True
-    endings = ("", *(f"-{count}" for count in range(2, MAX_OF_ONE_NUMBER + 1)))
-    candidates = (numbering.with_ending(described, ending) for ending in endings)
-    number = next((candidate for candidate in candidates if taken.get(candidate, id) == id), None)
-    if number is None:
-        raise ValueError(f"{MAX_OF_ONE_NUMBER} patients have the same number as {id}")
+    candidates = (numbering.with_ending(described, ending) for ending in ENDINGS)
+    [number, *_] = (candidate for candidate in candidates if taken.get(candidate, id) == id)  # else ValueError
     taken[number] = id
     if number != described:
         row.identity = index.encrypted(id, {NUMBER: number, **fields})

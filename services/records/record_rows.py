@@ -215,10 +215,8 @@ def _restore_request(session: Session, request: str | None, answer: str, at: str
 
 def _patient_row(content: JsonObject) -> PatientRow:
     """Return the row that the content of a patient describes."""
-    identity = row_validation.text(content["identity"])
-    return PatientRow(
-        patient_id=row_validation.text(content["id"]), made_at=_moment(content["made_at"]), identity=identity
-    )
+    id, identity = (row_validation.text(content[name]) for name in ("id", "identity"))
+    return PatientRow(patient_id=id, made_at=_moment(content["made_at"]), identity=identity)
 
 
 def _visit_rows(

@@ -36,7 +36,7 @@ from services.errors import StoreDamaged
 from services.records import record_rows, row_validation, schema
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.json_values import JsonObject
-from services.records.patient_index import index_of
+from services.records.patient_rows import index_of
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles, new_key, note_key
 from services.records.record_rows import Content

@@ -177,10 +177,7 @@ class ObservedTimeRow(Base):
 
 
 class PatientRow(RecordColumns, Base):
-    """One patient: an opaque random id, time of creation (UTC), and `identity`: the encrypted number, name and so on.
-
-    `identity` is the text of `PatientIndex.encrypted`.
-    """
+    """One patient: opaque random id, time of creation (UTC), `identity`: number etc. (`PatientIndex.encrypted`)."""
 
     __tablename__ = "patients"
 
@@ -190,7 +187,6 @@ class PatientRow(RecordColumns, Base):
 
     __table_args__ = (
         Index("patients_to_sign", "patient_id", sqlite_where=text(UNSIGNED)),
-        CheckConstraint("length(identity) <= 10000", name="identity_is_short"),
         {"sqlite_strict": True},
     )
 

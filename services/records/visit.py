@@ -77,9 +77,8 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Visit:
-    """One visit of the patient with that number; timestamps are UTC, `day` is the local date (ISO 8601).
+    """One visit of the patient with that opaque id and number; timestamps are UTC, `day` is the local date (ISO 8601).
 
-    `patient_id`: opaque id of the patient, which may be written where the number may not.
     `fields`: answers by form field; `slots`: state by slot id. `finished_at`, `outcome`: None in an unfinished visit.
     """
 

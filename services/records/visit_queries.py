@@ -7,7 +7,7 @@ StoreDamaged.
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from datetime import date
 from typing import get_args
 
@@ -21,7 +21,7 @@ from services.records import patient_rows, row_validation
 from services.records.answers import IDENTIFIERS
 from services.records.capture import StoredVerdict
 from services.records.json_values import JsonValue
-from services.records.patient_index import index_of
+from services.records.patient_rows import index_of
 from services.records.programme import Programme
 from services.records.record_rows import visit_contents
 from services.records.record_signing import refuse_changed
@@ -142,14 +142,15 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
     contents = visit_contents(session, known)
     ids = [row.id for row in known]
     fields = _answers(session, ids)
-    index, identities = index_of(session), _identities(session, known)
+    query = select(PatientRow).where(PatientRow.patient_id.in_({row.patient for row in known}))
+    identities = {row.patient_id: row.identity for row in session.scalars(query)}
     taken = _taken(session, ids)
     decided = _decided(session, ids)
 
     def visit(row: VisitRow) -> Visit:
         with reading_record(row.id):
             refuse_changed("visit", row, contents[row.id])
-            number, identifiers = index.identity(row.patient, identities[row.patient])
+            number, identifiers = index_of(session).identity(row.patient, identities[row.patient])
             slots = {
                 slot.id: SlotState(
                     tuple(_taken_capture(*columns) for columns in taken[row.id, slot.id]),
@@ -158,10 +159,8 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
                 for slot in programme.slots
             }
             finished_at = None if row.finished_at is None else row_validation.timestamp(row.finished_at)
-            answers = {
-                row_validation.text(name): row_validation.form_value(value)
-                for name, value in [*_parsed(fields[row.id]), *identifiers.items()]
-            }
+            values = {name: row_validation.parsed_json(value) for name, value in fields[row.id].items()} | identifiers
+            answers = {row_validation.text(name): row_validation.form_value(value) for name, value in values.items()}
             return Visit(
                 row.id,
                 row.patient,
@@ -226,19 +225,6 @@ def _answers(session: Session, ids: Sequence[str]) -> dict[str, dict[str, str]]:
         if field.visit in out:  # a damaged row may differ from the index
             out[field.visit][field.name] = field.value
     return out
-
-
-def _parsed(fields: Mapping[str, str]) -> Iterator[tuple[str, JsonValue]]:
-    """Yield name and value of answers that are given as JSON texts."""
-    for name, value in fields.items():
-        yield name, row_validation.parsed_json(value)
-
-
-def _identities(session: Session, rows: Sequence[VisitRow]) -> dict[str, str]:
-    """Return the encrypted identity of the patient of each visit, by patient id."""
-    query = select(PatientRow.patient_id, PatientRow.identity)
-    found = session.execute(query.where(PatientRow.patient_id.in_({row.patient for row in rows})))
-    return {row.patient_id: row.identity for row in found}
 
 
 def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[object, ...]]]:

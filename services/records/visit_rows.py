@@ -9,7 +9,7 @@ from services.errors import VisitFinished
 from services.records import visit_queries
 from services.records.answers import IDENTIFIERS
 from services.records.json_values import FormValue, JsonValue
-from services.records.patient_index import index_of
+from services.records.patient_rows import index_of
 from services.records.programme import Programme
 from services.records.record_document import as_object
 from services.records.row_validation import parsed_json, reading_record
@@ -35,10 +35,7 @@ def record_change(
     user: str,
     why: str | None = None,
 ) -> None:
-    """Add one change of a visit at a time (UTC text) to its history; no effect if nothing changes.
-
-    Values of an identifying field are encrypted under the patient's key.
-    """
+    """Add one change of a visit at a time (UTC text) to its history, identifying values encrypted; none if equal."""
     if was == value:
         return
     if field in IDENTIFIERS:

@@ -18,8 +18,8 @@ from services.errors import StoreDamaged
 from services.records import schema
 from services.records.capture import Capture, CaptureReport, StoredVerdict
 from services.records.capture_store import CaptureStore
-from services.records.patient_index import PatientIndex
 from services.records.patient_keys import PatientKeys
+from services.records.patient_rows import PatientIndex
 from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_document import RecordDocument, parse_document

@@ -45,8 +45,7 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
         copied = repository.requests.run_once(
             key, request, lambda: _copied(store, repository, visit, drives.mounted_folder(order.folder))
         )
-        folder, name = copied.split("/")
-        return FolderName(folder=f"{folder}/{visit.number}-{name}")
+        return FolderName(folder=copied.replace("/", f"/{visit.number}-", 1))
 
     return router
 
@@ -58,10 +57,7 @@ def _listed(drive: UsbDrive) -> UsbDriveAnswer:
 
 
 def _copied(store: CaptureStore, repository: VisitRepository, visit: Visit, drive: Path) -> str:
-    """Copy a visit to a drive, and record the export of a finished one.
-
-    Return the drive's name and the folder on it without the patient number, since that is stored with the request.
-    """
+    """Copy a visit to a drive, and record it if finished; return drive and folder without the number: it is stored."""
     folder = copy_to_drive(drive, folder_name(visit), export_files(store, visit, repository.undo_until(visit)))
     if visit.finished_at is not None and store.refusal is None:
         ExportRecords(store.folder).write(visit.id, visit.finished_at, repository.clock.wall())

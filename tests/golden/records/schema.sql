@@ -135,8 +135,7 @@ CREATE TABLE patients (
 	identity TEXT NOT NULL, 
 	revision INTEGER DEFAULT '0' NOT NULL, 
 	record_sha256 TEXT, 
-	PRIMARY KEY (patient_id), 
-	CONSTRAINT identity_is_short CHECK (length(identity) <= 10000)
+	PRIMARY KEY (patient_id)
 )
  STRICT;
 

@@ -113,7 +113,6 @@ def _create_patients() -> None:
         sa.Column("made_at", sa.Text, nullable=False),
         sa.Column("identity", sa.Text, nullable=False),
         *_signing_columns(),
-        sa.CheckConstraint("length(identity) <= 10000", name="identity_is_short"),
         sqlite_strict=True,
     )
     op.create_table(
