@@ -126,11 +126,13 @@ def write_atomically(path: Path, content: bytes, mode: int | None = PRIVATE_FILE
     fsync_folder(path.parent)
 
 
-def overwrite(path: Path, content: bytes, at_byte: int = 0) -> None:
-    """Overwrite a part of a file in place, durably: no older file with the replaced content stays on the disk."""
+def overwrite(path: Path, content: bytes, at_byte: int = 0, whole: bool = False) -> None:
+    """Overwrite a part of a file, or the `whole`, in place and durably: no older file with what was there stays."""
     with open(path, "r+b") as file:
         file.seek(at_byte)
         file.write(content)
+        if whole:
+            file.truncate()
         file.flush()
         os.fsync(file.fileno())
 

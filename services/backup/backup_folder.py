@@ -195,7 +195,7 @@ def _write_and_read_back(path: Path, content: bytes, in_place: bool = False) -> 
     damage a complete one.
     """
     if in_place and path.exists():
-        atomic_io.overwrite(path, content)
+        atomic_io.overwrite(path, content, whole=True)  # age adds some bytes of random length
     else:
         path.unlink(missing_ok=True)  # incomplete, or changed
         atomic_io.write_file(path, content)

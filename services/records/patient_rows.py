@@ -49,7 +49,7 @@ class PatientIndex:
             return row_validation.text(values[NUMBER]), fields
 
     def numbers(self, session: Session) -> dict[str, str]:
-        """Return the readable numbers by patient id; only identities that are new, of any process, are decrypted."""
+        """Return the readable numbers by patient id; only new identities are decrypted, of any process."""
         rows = session.execute(select(PatientRow.patient_id, PatientRow.identity)).all()
         return {id: number for id, identity in rows if (number := self._number(id, identity)) is not None}
 
@@ -60,7 +60,7 @@ class PatientIndex:
 
 
 def index_of(session: Session) -> PatientIndex:
-    """Return the index of the store whose tables a session reads, which `CaptureStore` gives to its engine."""
+    """Return the index that `CaptureStore` gives to the engine of its tables."""
     index: PatientIndex = session.get_bind().get_execution_options()["patients"]
     return index
 
@@ -76,9 +76,8 @@ def identity(session: Session, id: str) -> tuple[str, dict[str, JsonValue]]:
 def set_field(session: Session, id: str, name: str, value: FormValue) -> JsonValue:
     """Set an identifying field of a patient, None to remove it; return its value before. Errors as in `identity`."""
     number, fields = identity(session, id)
-    kept: dict[str, object] = {NUMBER: number, **fields, name: value}
-    row = session.get_one(PatientRow, id)
-    row.identity = index_of(session).encrypted(id, {key: known for key, known in kept.items() if known is not None})
+    kept = {key: known for key, known in {NUMBER: number, **fields, name: value}.items() if known is not None}
+    session.get_one(PatientRow, id).identity = index_of(session).encrypted(id, kept)
     return fields.get(name)
 
 
