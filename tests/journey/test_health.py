@@ -49,7 +49,7 @@ def test_damaged_capture_fails_the_captures_check(rig: Any) -> None:
     path.write_bytes(path.read_bytes()[:-1] + b"\x00\x01")
     checks = {check["name"]: check for check in rig.request("GET", "/api/health").json()["checks"]}
     assert not checks["captures"]["ok"]
-    assert "SHA-256" in checks["captures"]["value"]
+    assert "raw.tiff" in checks["captures"]["value"]
 
 
 def test_unreachable_or_hanging_server_fails_the_page_check() -> None:

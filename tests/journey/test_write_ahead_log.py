@@ -13,6 +13,7 @@ from device.errors import StoreFull
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.patient_keys import FILES
 from services.records.programme import load_programme
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_files import CAPTURE_RECORD as RECORD
@@ -99,10 +100,12 @@ def spent_of(folder: Path) -> dict[str, float]:
 def test_health_counts_orphans_and_gives_a_remedy(
     killed: tuple[Path, list[str]], served_head: Path, environment: dict[str, str], tmp_path: Path
 ) -> None:
-    """The copy has captures/ and store.sqlite of a killed instrument; health counts the one without a record."""
+    """The copy has captures, database and keys of a killed instrument; health counts the one without a record."""
     (data, kept), copy = killed, tmp_path / "copy"
     shutil.copytree(data / "captures", copy / "captures")
-    shutil.copyfile(data / "store.sqlite", copy / "store.sqlite")
+    shutil.copytree(data / "access", copy / "access")
+    for name in ("store.sqlite", *FILES):
+        shutil.copyfile(data / name, copy / name)
     (copy / "captures" / kept[0] / RECORD).unlink()  # as a release before the record wrote it
     with Server(served_head, copy, environment).running():
         pass  # a start, and a kill
