@@ -15,6 +15,7 @@ the earlier ones complete, and the next one continues.
 """
 
 import hashlib
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -195,6 +196,7 @@ def _write_and_read_back(path: Path, content: bytes, in_place: bool = False) -> 
     damage a complete one.
     """
     if in_place and path.exists():
+        os.truncate(path, min(path.stat().st_size, len(content)))  # age adds a part of random length
         atomic_io.overwrite(path, content)
     else:
         path.unlink(missing_ok=True)  # incomplete, or changed
