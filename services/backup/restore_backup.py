@@ -15,7 +15,8 @@ from services.backup.backup_folder import PATIENT_KEYS, backup_numbers, backup_p
 from services.backup.backup_key import SecretKey, read_header
 from services.backup.write_backup import MANIFEST, Manifest
 from services.errors import BackupDamaged, BackupKeyWrong, RestoreRefused
-from services.records import patient_keys, schema
+from services.identity.audit_key import find_audit_key
+from services.records import erasure, patient_keys, schema
 from services.records.earlier_stores import refuse_earlier_store
 from services.records.restoration import begin_restoration, commit_restoration, finish_restoration
 from services.records.snapshots import carry_dose, refuse_in_use
@@ -52,8 +53,9 @@ def restore_backup(
     """Restore the newest readable backup in a folder of backups, or that with `number`, into an unused store.
 
     A backup needs the seal of its device, and every unit the SHA-256 in it; one that is missing, unreadable or changed
-    is left out and named. A dose that the device has counted is never lowered. Until the last step nothing in the store
-    changes; what a power cut interrupts after it, the next opening or restoration completes. Errors: RestoreRefused
+    is left out and named. A dose that the device has counted is never lowered, and patients whom it has erased are
+    erased again by the next opening. Until the last step nothing in the store changes; what a power cut interrupts
+    after it, the next opening or restoration completes. Errors: RestoreRefused
     (the store has records), BackupKeyWrong, BackupDamaged (no backup can be read), UsbDriveUnavailable, StoreFull,
     StoreError (the instrument is running, the disk refuses, or store or backup are of a version before the first
     release).
@@ -74,6 +76,8 @@ def restore_backup(
             refuse_earlier_store(part / schema.DATABASE, f"the backup in {folder}")
             damaged = _write_keys(part, folder, key) + _write_units(part, folder, manifest, key, progress)
             carry_dose(store / schema.DATABASE, part / schema.DATABASE)
+            if (store / erasure.LIST).exists():
+                erasure.carry_erasures(store, find_audit_key(store), part, find_audit_key(part))
             _sync_folders(part)
             commit_restoration(store)
     progress(len(manifest.units), len(manifest.units))

@@ -9,13 +9,20 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import pyrage
 import pytest
 from typer.testing import CliRunner
 
 from device.errors import InputError, StoreError
+from services.backup.backup_folder import find_folder
+from services.backup.backup_key import SecretKey, key_for_recipients, write_key
+from services.backup.restore_backup import restore_backup
+from services.backup.write_backup import write_backup
 from services.errors import RecordErased, RecordNotFound, StoreDamaged
+from services.identity.audit_key import FILES as AUDIT_KEYS
 from services.identity.audit_key import read_audit_key
 from services.identity.erase_command import app
+from services.identity.users import FOLDER
 from services.records import erasure, patient_keys
 from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal
@@ -244,3 +251,61 @@ def test_the_command_erases_a_patient_and_verifies_the_receipt(folder: Path) -> 
     receipt.write_text(receipt.read_text().replace("withdrawn", "mistake"))
     with pytest.raises(StoreDamaged, match="receipt was changed"):
         CliRunner().invoke(app, check, catch_exceptions=False)
+
+
+def backed_up(folder: Path, to: Path) -> None:
+    write_backup(folder, to, CLOCK, lambda done, total: None)
+
+
+def restored(source: Path, folder: Path, key: SecretKey, number: int | None = None) -> None:
+    restore_backup(find_folder(source), key, folder, lambda done, total: None, number)
+
+
+def test_no_backup_brings_an_erased_patient_back_and_the_others_return_byte_for_byte(
+    folder: Path, tmp_path: Path
+) -> None:
+    identity = pyrage.x25519.Identity.generate()
+    key = key_for_recipients([str(identity.to_public())])
+    secret = SecretKey(str(identity), key.secret)
+    write_key(folder, key)
+    stick, ids = tmp_path / "stick", ids_of(folder, NUMBER)
+    stick.mkdir()
+    backed_up(folder, stick)
+    with opened(folder) as store:
+        others = shown(store, OTHER)
+    older = shutil.copytree(stick, tmp_path / "copy of the stick before the erasure")
+    erased(folder)
+    backed_up(folder, stick)
+
+    restored(stick, tmp_path / "first backup", secret, 1)
+    device = tmp_path / "device"  # without records, but it has erased the patient
+    (device / FOLDER).mkdir(parents=True)
+    for name in (erasure.LIST, *(f"{FOLDER}/{name}" for name in AUDIT_KEYS)):
+        shutil.copy(folder / name, device / name)
+    restored(older, device, secret)
+    for place in (tmp_path / "first backup", device):
+        with opened(place) as store:
+            assert shown(store, OTHER) == others
+            with pytest.raises(RecordNotFound):
+                store.erasures.find(NUMBER)
+        assert hits(place, [*plain_parts(NUMBER), *(id.encode() for id in ids[1:])]) == []
+
+    restored(older, tmp_path / "elsewhere", secret)  # a copy of the keys that no backup has replaced
+    ids_of(tmp_path / "elsewhere", NUMBER)
+
+
+def test_what_an_older_backup_holds_of_an_erased_patient_is_encrypted(folder: Path, tmp_path: Path) -> None:
+    identity = pyrage.x25519.Identity.generate()
+    key = key_for_recipients([str(identity.to_public())])
+    write_key(folder, key)
+    backed_up(folder, tmp_path)
+    before = set(tmp_path.rglob("*.age"))
+    wrapped = (folder / patient_keys.FILES[0]).read_bytes()
+    erased(folder)
+    backed_up(folder, tmp_path)
+    (patient_id,) = erasure.listed(folder, read_audit_key(folder))
+    contents = [pyrage.decrypt(path.read_bytes(), [identity]) for path in before]
+    slots = [wrapped[at : at + patient_keys.SLOT_BYTES] for at in range(0, len(wrapped), patient_keys.SLOT_BYTES)]
+    gone = [slot for slot in slots if not any(slot in content for content in contents)]
+    assert [patient_id.encode() in slot for slot in gone] == [True]
+    assert not [part for part in plain_parts(NUMBER) for content in contents if part in content]
