@@ -57,6 +57,7 @@ def rebuild(
 
 
 @app.command()
+@announced("copying captures")
 def copy(
     capture: Annotated[list[str], typer.Argument(help="Ids of captures, names of folders in captures/.")],
     data: Data,
@@ -68,7 +69,7 @@ def copy(
 
     if not (data / "captures").is_dir():
         raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
-    with announcing("copying"), CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
+    with CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
         atomic_io.make_folder(output)
         for id in capture:
             atomic_io.write_folder(output / id, {name: store.read(id, name) for name in store.get(id).files})

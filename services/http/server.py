@@ -216,20 +216,19 @@ def serve(
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
         undo.callback(arbiter.close)
         backups = undo.enter_context(closing(BackupRunner(data, lambda: arbiter.is_idle, clock)))
-        routers = [
-            accuracy_routes(explorer, store, lambda: arbiter.exam.head.calibration),
-            update_routes(UpdateRequests(*updater, clock, version("diffuscope"))),
-            event_log_routes(event_log, UsbDrives(), clock),
-            backup_routes(backups, store, UsbDrives(), clock),
-            erasure_routes(arbiter, backups),
-        ]
         authenticator = Authenticator(data / FOLDER, clock, _has_demo(spec, listeners), store.refusal, tls)
         app = create_app(
             arbiter,
             authenticator,
             programme,
             own_host_names() + host_names + tuple(name for listener in listeners for name in listener.host_names),
-            technician_routers=routers,
+            technician_routers=[
+                accuracy_routes(explorer, store, lambda: arbiter.exam.head.calibration),
+                update_routes(UpdateRequests(*updater, clock, version("diffuscope"))),
+                event_log_routes(event_log, UsbDrives(), clock),
+                backup_routes(backups, store, UsbDrives(), clock),
+                erasure_routes(arbiter, backups),
+            ],
             uploader=uploader,
             audit_log=_audit_log(store, key, clock),
         )

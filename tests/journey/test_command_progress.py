@@ -26,6 +26,7 @@ NOT_ANNOUNCED = {
     "store backup": ASKING,
     "store restore": ASKING,
     "snapshots restore": ASKING,
+    "erase patient": ASKING,
     "users add": ASKING,
     "users reset": ASKING,
     "frontier": STEPS,

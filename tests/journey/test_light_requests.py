@@ -114,6 +114,7 @@ def test_the_lamp_goes_dark_when_the_user_is_signed_out_or_idle(make_rig: MakeRi
     else:
         rig.clock.elapsed_s += IDLE_LOCK_S
     assert status("GET", live) == 401
+    wait_until_idle(rig)  # light of the last request is counted until it ends
     given = doses_j_per_cm2(rig)
     for method, path in (("GET", live), ("POST", "/api/captures"), ("POST", "/api/calibration")):
         assert status(method, path) == 401

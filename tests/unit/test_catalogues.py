@@ -41,7 +41,7 @@ def placeholders(words: str) -> set[str]:
 ENGLISH, TECHNICIAN = catalogue("en"), catalogue("technician/en")
 
 
-@pytest.mark.parametrize("name", ["en", "technician/en", *DRAFTS])
+@pytest.mark.parametrize("name", ["en", "technician/en", "pairing/en", *DRAFTS])
 def test_a_catalogue_is_flat_and_its_plurals_are_complete(name: str) -> None:
     table = catalogue(name)
     assert {key for key, words in table.items() if not isinstance(words, str) or not words.strip()} == set()
@@ -49,9 +49,10 @@ def test_a_catalogue_is_flat_and_its_plurals_are_complete(name: str) -> None:
     assert {key for key, words in table.items() if re.search(r"[{}]", re.sub(r"\{\{\w+\}\}", "", words))} == set()
 
 
+@pytest.mark.parametrize("folder", ["", "pairing/"])
 @pytest.mark.parametrize("language", DRAFTS)
-def test_a_translation_has_only_master_keys_and_variables(language: str) -> None:
-    master, draft = by_key(ENGLISH), by_key(catalogue(language))
+def test_a_translation_has_only_master_keys_and_variables(language: str, folder: str) -> None:
+    master, draft = by_key(catalogue(f"{folder}en")), by_key(catalogue(folder + language))
     assert set(draft) <= set(master)
     for key, forms in draft.items():
         assert set(forms) == set(master[key]), key
