@@ -58,7 +58,6 @@ class UserLogin extends HTMLElement {
 
   #actions = {
     forget: () => this.#show("forgotten"),
-
     choose: (name) => {
       this.#set({ name, error: "" });
       this.#focus();
