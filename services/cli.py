@@ -168,7 +168,7 @@ def label(
     data: Annotated[Path | None, typer.Option(help="Data folder; by default that of the device.")] = None,
     pairing_port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the pairing page.")] = 80,
 ) -> None:
-    """Print how a tablet is paired with this device: address, QR code, fingerprint, and the code of a new device."""
+    """Print how a tablet is paired with this device: address, QR code, fingerprint, and a set-up code."""
     from services.identity.apply_at_boot import Computer
     from services.identity.label import pairing_label
     from services.identity.renewal import OUTPUT

@@ -9,6 +9,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── ConfirmationRequired          PIN to be typed again before a risk
 │   ├── AccessDenied                  the roles of the user do not permit it
 │   ├── SecretWrong                   wrong name, PIN, passphrase or set-up code
+│   ├── PresenceRequired              set-up of a device with users, and no user is seen at the device
 │   └── SignInLockedOut               lock-out after repeated wrong secrets
 ├── Busy                              the instrument is occupied
 ├── RequestRefused                    request not permitted, or not now
@@ -112,6 +113,13 @@ class SecretWrong(AuthenticationError):
 
     code = "access.wrong"
     default_remedy = "Type name and PIN again. An administrator can give a new PIN."
+
+
+class PresenceRequired(AuthenticationError):
+    """Set-up of a device with users without a recent press of its button; without a button, from another screen."""
+
+    code = "access.presence"
+    default_remedy = "Hold the button of the camera for three seconds. Send this again within half a minute."
 
 
 class SignInLockedOut(AuthenticationError):

@@ -117,7 +117,7 @@ def create_app(
     app.include_router(status_router(arbiter, visits, lease, alerts, worker))
     app.include_router(preview_router(arbiter, visits), dependencies=[lit, Depends(limit_clients(preview_limits))])
     app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
-    app.include_router(login_router(authenticator))
+    app.include_router(login_router(authenticator, lambda: arbiter.pressed_s))
     app.include_router(users_router(authenticator.users))
     app.include_router(audit_router(audit_log))
     app.include_router(clock_router(clock, system))

@@ -26,6 +26,7 @@ VIEW, LIST_VISITS, LIST_PICTURES, LIST_USERS, READ_EVENT_LOG, HOLD_CAMERA = (
 # address without a login asks, has one for each action and status, since each entry is written with fsync.
 REPEATED = {VIEW, LIST_VISITS, LIST_PICTURES, LIST_USERS, READ_EVENT_LOG, HOLD_CAMERA}
 AGAIN_S = 300.0
+RESET_ADMINISTRATOR = "reset-administrator"  # the set-up of a device with users
 REFUSED = "refused"  # before access: a foreign host name or origin, or a body that is too large
 REFUSED_STATUS = {400, 403, 422}
 ACTIONS = {
@@ -137,7 +138,7 @@ class AuditTrail:
 
     async def _record(self, scope: Scope, status: int) -> None:
         state = scope.get("state", {})
-        action = ACTIONS.get(state.get("operation", ""))
+        action = state.get("audit_action") or ACTIONS.get(state.get("operation", ""))
         if "operation" not in state and status in REFUSED_STATUS:
             action = REFUSED
         if action is None or self._log is None:

@@ -1,4 +1,4 @@
-"""Authentication of users: sign-in with lock-out, set-up of the first administrator, the demonstration user."""
+"""Authentication of users: sign-in with lock-out, set-up of an administrator, the demonstration user."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ from starlette.requests import HTTPConnection
 
 from device.clock import Clock
 from device.errors import StoreError
-from services.errors import RecordNotFound, SecretWrong, SetupRequired, SignInLockedOut
+from services.errors import PresenceRequired, SecretWrong, SetupRequired, SignInLockedOut
 from services.http.client_limits import Client
 from services.identity.lock_out import LockOut
 from services.identity.logins import Logins
@@ -19,6 +19,8 @@ from services.identity.users import User, UserTable
 DEMO_USER = User("Demo", frozenset({"screener", "reader", "technician"}), is_demo=True)
 PROXY_HEADERS = ("forwarded", "via", "x-forwarded-for")
 CODE_REMEDY = "A code is valid for two minutes and five tries. `diffuscope label` on the device makes a new one."
+PRESSED_S = 30.0  # in which a press of the button shows that the user is at the device
+OWN_SCREEN_REMEDY = "Open this page on the screen of the device itself: its button cannot be read."
 SETUP_ACCOUNT, UNKNOWN_ACCOUNT = "set-up", "unknown"
 
 
@@ -55,7 +57,7 @@ class Authenticator:
         refusal: StoreError | None = None,
         tls: Path | None = None,
     ) -> None:
-        self._setup_code = SetupCode(tls or folder, clock)
+        self._setup_code = SetupCode(tls or folder, clock, folder)
         self.users = UserTable(folder, refusal)
         self.logins = Logins(self.users, clock)
         self._lock_out = LockOut(folder, clock)
@@ -91,20 +93,30 @@ class Authenticator:
         user = self._verified(self._own_name(token), secret, peer)
         return self.logins.begin(self.users.change(user.name, secret=new, generation=user.generation))
 
-    def set_up(self, code: str, name: str, secret: str, peer: Peer) -> str:
-        """Create the first administrator, who has every role, and return the token of a login.
+    def set_up(self, code: str, name: str, secret: str, peer: Peer, pressed_s: float | None) -> str:
+        """Create an administrator, who has every role, or give the one of that name a new secret; return a login token.
 
-        SecretWrong for a wrong code, RecordNotFound with a user, SignInLockedOut, InputError for name or secret.
+        `pressed_s`: time since the button of the head was pressed, None if none can be read. PresenceRequired with
+        users if that is too long ago, or without a button for another screen than the own one. SecretWrong for a wrong
+        or used code, SignInLockedOut, InputError for the secret or the name, as that of a user without administration.
         """
         with self._verifying:
-            if self.users.has_begun:
-                raise RecordNotFound("this device was set up already", "Sign in with your name and PIN.")
+            if self.users.has_begun:  # before the code: who is elsewhere can neither try one nor end it
+                _check_presence(peer, pressed_s)
             self._refuse_early(SETUP_ACCOUNT, peer)
             if not self._setup_code.is_valid(code):
                 self._lock_out.record_failure(SETUP_ACCOUNT, peer.address)
                 raise SecretWrong("this is not the set-up code", CODE_REMEDY)
-            user = self.users.add(name, secret, DEMO_USER.roles | {"administrator"})
+            user = self._administrator(name, secret)
+            self._setup_code.end()
+            self._lock_out.record_success(SETUP_ACCOUNT, peer.address)
         return self.logins.begin(user)
+
+    def _administrator(self, name: str, secret: str) -> User:
+        user = self.users.find(name)
+        if user is None or "administrator" not in user.roles:
+            return self.users.add(name, secret, DEMO_USER.roles | {"administrator"})
+        return self.users.change(name, secret=secret, generation=user.generation)
 
     def _own_name(self, token: str | None) -> str:
         user = self.logins.user(token)
@@ -130,3 +142,10 @@ class Authenticator:
         """Return the account of the lock-out: a new secret begins a new one, all unknown names share one."""
         user = self.users.find(name)
         return UNKNOWN_ACCOUNT if user is None else f"{user.name} {user.generation}"
+
+
+def _check_presence(peer: Peer, pressed_s: float | None) -> None:
+    if pressed_s is None and not peer.is_own_screen:
+        raise PresenceRequired("this device has users already", OWN_SCREEN_REMEDY)
+    if pressed_s is not None and pressed_s > PRESSED_S:
+        raise PresenceRequired("the button of the camera was not pressed")

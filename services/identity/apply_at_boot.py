@@ -53,8 +53,8 @@ class Computer:
             self._set_machine_id(identity.machine_id)
 
     def show_setup_code(self, code: str) -> None:
-        """Show a set-up code on the console, above the login prompt; a device with a user refuses it."""
-        text = f"  Set-up code, if this device has no user yet: {code[:4]}-{code[4:]}\n\n"
+        """Show a set-up code on the console, above the login prompt; with users it needs the button of the head too."""
+        text = f"  Set-up code, for a new device or a forgotten PIN: {code[:4]}-{code[4:]}\n\n"
         self._write_private("run/issue.d/diffuscope-setup.issue", text.encode())
 
     def _access_point(self, identity: Identity) -> bytes:

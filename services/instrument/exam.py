@@ -83,6 +83,7 @@ class ExamService:
         )
         origin = CaptureOrigin(head, store.folder)
         work = parts, lambda: plan_pipeline(head, clock, plans, origin), self.ready.set, on_failure
+        self.button = parts.button
         self._thread = Thread(target=run_exam, args=work, name="head", daemon=True)
         self._thread.start()
 

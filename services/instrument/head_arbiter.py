@@ -275,6 +275,14 @@ class HeadArbiter:
         return self._transfer.owner
 
     @property
+    def pressed_s(self) -> float | None:
+        """Seconds since the button of the head was pressed; None if none can be read, or the exam has no head."""
+        exam = self.owner.exam
+        if exam is None or not exam.button.is_readable:
+            return None
+        return self.context.clock.now_s() - exam.button.pressed_at_s
+
+    @property
     def exam(self) -> ExamService:
         """The exam; raises `HeadOwner.absence` while it does not own the head."""
         if (exam := (owner := self.owner).exam) is None:

@@ -129,6 +129,33 @@ def test_a_new_device_is_set_up_with_its_code(own_server: Server, open_page: Ope
     expect(page.locator("#menu")).to_contain_text("Signed in: Asha")
 
 
+def test_a_forgotten_pin_is_replaced_with_the_code(own_server: Server, open_page: Open, complaints: Complaints) -> None:
+    """This head has no button: the code and the screen of the device suffice."""
+    complaints.expect("401", "403", "429")
+    users = UserTable(own_server.data / FOLDER)
+    users.add("Asha", PIN, ["administrator"])
+    page = open_page(own_server.url)
+    dialog = page.locator("dialog.login")
+    expect(dialog.locator("#forgotten")).to_be_visible(timeout=20_000)
+    assert faults(page) == []
+    dialog.locator("[name=secret]").fill("000000")
+    dialog.locator("#forgotten").tap()
+    expect(dialog).to_contain_text("hold the button of the camera")
+    expect(dialog.locator("[name=secret]")).to_have_value("")
+    assert faults(page) == []
+    page.keyboard.press("Escape")
+    expect(dialog.locator("#forgotten")).to_be_visible()
+    page.wait_for_timeout(PRESS_MS)
+    dialog.locator("#forgotten").tap()
+    dialog.locator("[name=code]").fill(SetupCode(own_server.data / "tls", SystemClock()).create())
+    dialog.locator("[name=name]").fill("asha")
+    for name in ("secret", "again"):
+        dialog.locator(f"[name={name}]").fill("918274")
+    page.keyboard.press("Enter")
+    expect(dialog).to_be_hidden(timeout=20_000)
+    assert users.verify("Asha", "918274") is not None
+
+
 def test_an_administrator_erases_a_patient_and_stores_the_receipt(
     own_server: Server, open_page: Open, complaints: Complaints
 ) -> None:

@@ -181,8 +181,9 @@ def test_a_tablet_is_refused_then_paired_set_up_and_takes_a_picture(
     again.goto(f"{device.https}/#code={code[1]}")
     expect(again.locator("dialog.login")).to_contain_text("Sign in")
     body = json.dumps({"name": "Eve", "secret": PIN, "code": code[1]})
-    assert asked(again, "/api/setup", body)["code"] == "store.unknown", "the code was used"
-    assert "Set-up code" not in device.label()
+    assert asked(again, "/api/setup", body)["code"] == "access.wrong", "the code was used"
+    again.wait_for_timeout(1100)  # the wait after a wrong code
+    assert "Forgotten PIN" in device.label()
     again.locator("[name=name]").fill("Asha")
     again.locator("[name=secret]").focus()
     again.keyboard.type(PIN)

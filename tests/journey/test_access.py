@@ -4,6 +4,8 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from copy import copy
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,16 @@ import pytest
 from fastapi.responses import PlainTextResponse
 
 from device.clock import VirtualClock
+from device.sim.chips import SimButton
+from device.sim.world import World
+from device.values import Calibration
 from services.delivery.uploader import HttpsUploader, UploadSettings
 from services.errors import AuthenticationError
 from services.health.clock_request import REQUEST
 from services.http.access import ACCESS, Access
 from services.http.app import create_app
 from services.http.audit_trail import ACTIONS, UNRECORDED
-from services.http.authentication import OWN_SCREEN, Authenticator, Peer
+from services.http.authentication import OWN_SCREEN, PRESSED_S, Authenticator, Peer
 from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
@@ -30,7 +35,7 @@ from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
 from services.records.patient_keys import ids_in_files
 from tests.golden import http_transcript
-from tests.journey.conftest import Rig, read_event_stream
+from tests.journey.conftest import MakeRig, Rig, read_event_stream, until
 
 PIN = "274913"
 AWAY, HERE = ("10.42.0.7", 50000), ("127.0.0.1", 50000)
@@ -244,7 +249,61 @@ def test_set_up_signs_in_the_first_administrator_once(fresh: Rig) -> None:
     cookie = done.headers["set-cookie"].lower()
     assert all(part in cookie for part in ("login=", "httponly", "samesite=strict", "path=/"))
     assert "max-age" not in cookie
-    assert ask(fresh.app, "POST", "/api/setup", json=asha | {"code": code}).status_code == 404
+    again = ask(fresh.app, "POST", "/api/setup", client=HERE, json=asha | {"code": code})
+    assert (again.status_code, again.json()["code"]) == (403, "access.wrong"), "a code is used once"
+
+
+@pytest.fixture
+def handle(template: tuple[World, Calibration]) -> World:
+    """The world of a button, which no test of the head changes."""
+    return copy(template[0])
+
+
+def test_a_forgotten_administrator_needs_code_and_button(make_rig: MakeRig, handle: World, tmp_path: Path) -> None:
+    rig = make_rig(head=lambda head: replace(head, button=SimButton(handle)))
+    add_users(rig)
+    earlier, folder = tokens(rig)["administrator"], rig.store.folder.parent / "access"
+    log = AuditLog(tmp_path, b"k" * 32, rig.clock)
+    app = create_app(rig.arbiter, rig.authenticator, audit_log=log).http
+    code, new = SetupCode(folder, rig.clock).create(), {"name": "Administrator", "secret": "918274"}
+
+    def asked(client: tuple[str, int] = AWAY, **more: str) -> tuple[int, str]:
+        answer = ask(app, "POST", "/api/setup", client=client, json=new | {"code": code} | more)
+        return answer.status_code, answer.json().get("code", "")
+
+    assert [asked(), asked(HERE), asked(code="WRONG")] == [(403, "access.presence")] * 3, "no button was pressed"
+    handle.pressed_since_s = rig.clock.now_s()
+    until(lambda: rig.arbiter.pressed_s == 0)
+    rig.clock.sleep(PRESSED_S + 1)
+    assert asked() == (403, "access.presence"), "the press was too long ago"
+    handle.pressed_since_s = rig.clock.now_s()
+    until(lambda: rig.arbiter.pressed_s == 0)
+    assert asked(code="WRONG") == (403, "access.wrong")
+    rig.clock.sleep(1)
+    assert asked(secret="123456") == (422, "input")
+    assert asked(name="reader") == (422, "input"), "a user without administration"
+    assert ask(app, "GET", "/api/users", earlier).status_code == 200
+    assert asked() == (200, "")
+    assert ask(app, "GET", "/api/users", earlier).status_code == 401
+    user = rig.authenticator.users.verify("administrator", "918274")
+    assert user is not None
+    assert user.roles == {"administrator"}
+    assert asked(secret="482915") == (403, "access.wrong"), "a code is used once"
+    entries = log.entries(100, action="reset-administrator")
+    assert [entry.more["status"] for entry in entries].count("200") == 1
+    assert len(entries) == 9
+
+
+def test_without_a_button_the_screen_of_the_device_creates_a_further_administrator(fresh: Rig) -> None:
+    add_users(fresh)
+    code = SetupCode(fresh.store.folder.parent / "access", fresh.clock).create()
+    asha = {"name": "Asha", "secret": PIN, "code": code}
+    away = ask(fresh.app, "POST", "/api/setup", json=asha)
+    assert (away.status_code, away.json()["code"]) == (403, "access.presence")
+    assert "screen of the device" in away.json()["remedy"]
+    done = ask(fresh.app, "POST", "/api/setup", client=HERE, json=asha)
+    assert done.json()["user"]["roles"] == list(ROLES)
+    assert [user.name for user in fresh.authenticator.users.users()][:2] == ["administrator", "Asha"]
 
 
 def test_a_thousand_wrong_codes_end_the_code_and_are_in_the_audit_log(fresh: Rig, tmp_path: Path) -> None:

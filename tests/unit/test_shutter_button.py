@@ -22,8 +22,10 @@ def test_each_press_is_published_once() -> None:
     assert [after(since_s) for since_s in (None, 1.0, 1.0, None, 2.5, 3.5, None)] == [0, 1, 1, 1, 2, 3, 3]
     world.faults.add("bus.silent")
     assert after(9.0) == 3
+    assert (button.is_readable, button.pressed_at_s) == (False, 3.5)
     world.faults.clear()
     assert after(9.0) == 4
+    assert (button.is_readable, button.pressed_at_s) == (True, 9.0)
 
 
 def test_a_head_without_a_button_publishes_nothing() -> None:

@@ -132,6 +132,16 @@ def test_a_set_up_code_ends_with_the_fifth_wrong_try_and_with_the_boot(tmp_path:
     assert not codes.is_valid(code)
 
 
+def test_a_used_set_up_code_stays_ended_in_a_restarted_server(tmp_path: Path, clock: VirtualClock) -> None:
+    console, server = SetupCode(tmp_path / "tls", clock), SetupCode(tmp_path / "tls", clock, tmp_path)
+    code = console.create(inf)
+    assert server.is_valid(code)
+    server.end()
+    for restarted in (server, SetupCode(tmp_path / "tls", clock, tmp_path)):
+        assert not restarted.is_valid(code)
+    assert server.is_valid(console.create())
+
+
 def test_the_code_of_the_console_is_valid_until_a_label_replaces_it(tmp_path: Path, clock: VirtualClock) -> None:
     codes = SetupCode(tmp_path, clock)
     assert not codes.is_of_this_boot

@@ -1,5 +1,6 @@
 // <user-login>: dialog over the whole page that asks for sign-in, for the set-up of a new device, for the PIN once more,
-// or for the own new PIN. What is behind it stays as it is; the event "login-changed" follows a login.
+// for the own new PIN, or for that of an administrator who forgot it. What is behind it stays as it is; the event
+// "login-changed" follows a login.
 
 import { icon } from "./icons.js";
 import { sentences } from "../core/api.js";
@@ -13,10 +14,11 @@ const REQUESTS = {
   "access.none": ["POST", "/api/login"],
   "access.setup": ["POST", "/api/setup"],
   "access.confirm": ["POST", "/api/login/confirm"],
+  forgotten: ["POST", "/api/setup"],
   own: ["PUT", "/api/login/secret"],
 };
 const CODE_OF_LABEL = new URLSearchParams(location.hash.slice(1)).get("code") ?? ""; // before the router replaces it
-const HAS_CANCEL = ["access.confirm", "own"];
+const HAS_CANCEL = ["access.confirm", "own"]; // over the page of a user who is signed in
 
 class UserLogin extends HTMLElement {
   /** @type {Asking} */
@@ -36,9 +38,16 @@ class UserLogin extends HTMLElement {
   }
 
   #ask(code) {
-    if (this.#state.code === code) return;
+    if (this.#state.code === code || this.#state.code === "forgotten") return; // the page behind asks again and again
     this.#set({ code, name: this.#state.name || (knownNames()[0] ?? ""), error: "" });
     if (!this.#dialog.open) this.#dialog.showModal();
+    this.#focus();
+  }
+
+  /** Show another form of the dialog; what was typed as a PIN is not that of the other one. */
+  #show(code) {
+    /** @type {HTMLInputElement} */ (this.querySelector("[name=secret]")).value = "";
+    this.#set({ code, error: "" });
     this.#focus();
   }
 
@@ -48,6 +57,7 @@ class UserLogin extends HTMLElement {
   }
 
   #actions = {
+    forget: () => this.#show("forgotten"),
     choose: (name) => {
       this.#set({ name, error: "" });
       this.#focus();
@@ -74,8 +84,10 @@ class UserLogin extends HTMLElement {
 
     /** The dialog of a login cannot be closed by Escape; the one of a user who is signed in can. */
     cancel: (event) => {
-      if (!HAS_CANCEL.includes(this.#state.code)) return event.preventDefault();
-      this.#set({ code: "", error: "", busy: false });
+      const { code } = this.#state;
+      if (HAS_CANCEL.includes(code)) return this.#set({ code: "", error: "", busy: false });
+      event.preventDefault();
+      if (code === "forgotten") this.#show("access.none");
     },
   };
 
@@ -89,24 +101,26 @@ class UserLogin extends HTMLElement {
 
 customElements.define("user-login", UserLogin);
 
-const TITLES = { "access.setup": "login.setup", "access.confirm": "login.confirm", own: "login.own" };
+const TITLES = { "access.setup": "login.setup", forgotten: "login.forgotten", "access.confirm": "login.confirm", own: "login.own" };
 
 /** @param {Asking} state */
 function view({ code, name, error, busy }, actions) {
-  const isSetup = code === "access.setup";
+  const isForgotten = code === "forgotten";
+  const isSetup = code === "access.setup" || isForgotten;
   const isOwn = code === "own";
   const hasCancel = HAS_CANCEL.includes(code);
   return html`<dialog class="login" aria-labelledby="login-title" @cancel=${actions.cancel}>
     <form @submit=${actions.submit} autocomplete="off">
       <h2 id="login-title">${icon("person")} ${t(TITLES[code] ?? "login.title")}</h2>
-      ${isSetup ? html`<p>${t("login.setup.why")}</p>${field("code", t("login.code"), "text", CODE_OF_LABEL)}` : nothing}
+      ${isSetup ? html`<p>${t("login.setup.why")} ${isForgotten ? t("login.forgotten.how") : ""}</p>${field("code", t("login.code"), "text", CODE_OF_LABEL)}` : nothing}
       ${hasCancel ? nothing : names(name, isSetup ? [] : knownNames(), actions)}
       ${field("secret", t(isSetup ? "login.new" : isOwn ? "login.old" : "login.pin"), "password")}
       ${isOwn ? field("new", t("login.new"), "password") : nothing}
       ${isSetup || isOwn ? field("again", t("login.again"), "password") : nothing}
       <p class="bad" role="alert">${error}</p>
-      <button class="primary" type="submit" aria-disabled=${busy}>${t(isSetup ? "login.create" : isOwn ? "login.own" : "login.open")}</button>
-      ${hasCancel ? html`<button type="button" @click=${({ target }) => target.closest("dialog").requestClose?.()}>${t("back")}</button>` : nothing}
+      <button class="primary" type="submit" aria-disabled=${busy}>${t(isForgotten ? "login.reset" : isSetup ? "login.create" : isOwn ? "login.own" : "login.open")}</button>
+      ${code === "access.none" ? html`<button type="button" id="forgotten" @click=${actions.forget}>${t("login.forgotten")}</button>` : nothing}
+      ${hasCancel || isForgotten ? html`<button type="button" @click=${({ target }) => target.closest("dialog").requestClose?.()}>${t("back")}</button>` : nothing}
     </form>
   </dialog>`;
 }

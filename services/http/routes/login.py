@@ -1,23 +1,26 @@
-"""Endpoints of sign-in, set-up of the first administrator, and the own secret."""
+"""Endpoints of sign-in, set-up of an administrator, and the own secret."""
+
+from collections.abc import Callable
 
 from fastapi import APIRouter, Request, Response
 
 from services.http.access import cookie_name, login_token
+from services.http.audit_trail import RESET_ADMINISTRATOR
 from services.http.authentication import Authenticator, Peer
 from services.http.schemas.access import LoginAnswer, SecretChange, SecretConfirmation, SetUp, SignIn, UserAnswer
 from services.identity.logins import IDLE_LOCK_S
 from services.identity.users import ROLES, User
 
 
-def login_router(authenticator: Authenticator) -> APIRouter:
-    """Return the router of sign-in and set-up."""
+def login_router(authenticator: Authenticator, pressed_s: Callable[[], float | None]) -> APIRouter:
+    """Return the router of sign-in and set-up; `pressed_s` as of `Authenticator.set_up`."""
     router = APIRouter()
-    router.include_router(_begin_router(authenticator))
+    router.include_router(_begin_router(authenticator, pressed_s))
     router.include_router(_own_router(authenticator))
     return router
 
 
-def _begin_router(authenticator: Authenticator) -> APIRouter:
+def _begin_router(authenticator: Authenticator, pressed_s: Callable[[], float | None]) -> APIRouter:
     """Return the router of the endpoints that need no login."""
     router = APIRouter()
 
@@ -50,13 +53,16 @@ def _begin_router(authenticator: Authenticator) -> APIRouter:
 
     @router.post("/api/setup")
     def set_up(typed: SetUp, request: Request, response: Response) -> LoginAnswer:
-        """Create the first administrator with the set-up code of the device, and sign in.
+        """Create an administrator, or give one a new secret, with the set-up code of the device, and sign in.
 
-        403 for a wrong code, 404 once a user exists, 422 for a name or secret that cannot be used, 429 during the
-        lock-out.
+        With users only within 30 s after a press of the device's button; a device without one asks for a request from
+        its own screen. All logins of the administrator end. 403 without the press and for a wrong or used code, 422
+        for a name or secret that cannot be used, 429 during the lock-out.
         """
         request.state.audit_user = typed.name
-        token = authenticator.set_up(typed.code, typed.name, typed.secret, Peer.of(request))
+        if authenticator.users.has_begun:
+            request.state.audit_action = RESET_ADMINISTRATOR
+        token = authenticator.set_up(typed.code, typed.name, typed.secret, Peer.of(request), pressed_s())
         return _begun(authenticator, token, request, response)
 
     return router

@@ -16,7 +16,7 @@ class SignIn(RequestBody):
 
 
 class SetUp(SignIn):
-    """Request body: set-up code, and name and secret of the first administrator."""
+    """Request body: set-up code, and name and secret of an administrator."""
 
     code: str = Field(max_length=40)
 
