@@ -1,4 +1,4 @@
-"""Screening programme, read from a TOML file: picture slots, retakes, reasons, rules of referral, patient numbers."""
+"""Screening programme, read from a TOML file: picture slots, retakes, reasons, referral, numbers, retention."""
 
 from pathlib import Path
 from typing import Literal, Self, get_args
@@ -48,6 +48,24 @@ class PatientNumbers(Table):
     device_in_number: bool = True
 
 
+class Retention(Table):
+    """Days after the last visit for which data of a patient are kept, 1 to 36500; without a number, always.
+
+    `raw_days`: raw frames. `pictures_days`: pictures. `identity_days`: identifying fields and patient number.
+    """
+
+    raw_days: int | None = Field(default=None, ge=1, le=36500)
+    pictures_days: int | None = Field(default=None, ge=1, le=36500)
+    identity_days: int | None = Field(default=None, ge=1, le=36500)
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        given = [days for days in (self.raw_days, self.pictures_days, self.identity_days) if days is not None]
+        if given != sorted(given):
+            raise ValueError("keep raw frames no longer than pictures, and pictures no longer than the identity")
+        return self
+
+
 class Programme(Table):
     """Screening programme: picture slots in their order, permitted reasons why a picture is not possible, rules.
 
@@ -64,6 +82,7 @@ class Programme(Table):
     colours: tuple[OtherColour, ...] = COLOURS
     referral: Referral
     numbers: PatientNumbers
+    retention: Retention = Field(default=Retention(), exclude=True)  # no part of the page
 
     @model_validator(mode="after")
     def _slots_differ(self) -> Self:

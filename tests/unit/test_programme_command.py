@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from device.errors import SpecError
 from services import cli
-from services.records.programme import DEFAULT_PROGRAMME
+from services.records.programme import DEFAULT_PROGRAMME, load_programme
 
 
 def test_a_valid_programme_is_summarised(capsys: pytest.CaptureFixture[str]) -> None:
@@ -23,3 +24,38 @@ def test_a_mistake_is_named_with_its_line(tmp_path: Path, capsys: pytest.Capture
         cli.main(["programme", "check", str(wrong)])
     assert ended.value.code == 2
     assert f"{wrong}, line 9: referral.vision_limit" in capsys.readouterr().err
+
+
+def with_table(folder: Path, table: str) -> Path:
+    """Write the programme of the package with one more table, in place of one of the same name."""
+    name = table.splitlines()[0]
+    text = "\n".join(line for line in DEFAULT_PROGRAMME.read_text().splitlines() if not line.startswith(name))
+    (folder / "programme.toml").write_text(f"{text}\n{table}\n")
+    return folder / "programme.toml"
+
+
+def test_retention_is_off_without_a_rule_and_printed_with_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for file, printed in (
+        (DEFAULT_PROGRAMME, "after the last visit: no rule"),
+        (with_table(tmp_path, "[retention]\nraw_days = 90\nidentity_days = 90"), "last visit: raw 90, identity 90"),
+    ):
+        with pytest.raises(SystemExit):
+            cli.main(["programme", "check", str(file)])
+        assert printed in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        "raw_days = 91\npictures_days = 90",
+        "pictures_days = 91\nidentity_days = 90",
+        "raw_days = 91\nidentity_days = 90",
+        "raw_days = 0",
+        "pictures_days = 1.5",
+    ],
+)
+def test_a_retention_rule_out_of_order_or_range_is_refused(tmp_path: Path, rules: str) -> None:
+    with pytest.raises(SpecError, match=r"programme.toml, line \d+: retention"):
+        load_programme(with_table(tmp_path, f"[retention]\n{rules}"))
