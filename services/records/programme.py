@@ -1,4 +1,4 @@
-"""Screening programme, read from a TOML file: picture slots, retakes, reasons, referral, numbers, retention."""
+"""Screening programme, read from a TOML file: picture slots, reasons, referral, numbers, retention, exports."""
 
 from pathlib import Path
 from typing import Literal, Self, get_args
@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from device.config.toml_file import Table, load_toml
 from device.values import EYES, Eye
 from services.errors import RecordNotFound
+from services.records.age_encryption import PublicKey
 from services.records.capture import OtherColour
 from services.records.capture_target import COLOURS, FRAMES
 
@@ -66,6 +67,12 @@ class Retention(Table):
         return self
 
 
+class Exports(Table):
+    """Encryption of exports: `recipients`, public keys of age; without one they are not encrypted."""
+
+    recipients: tuple[PublicKey, ...] = ()
+
+
 class Programme(Table):
     """Screening programme: picture slots in their order, permitted reasons why a picture is not possible, rules.
 
@@ -82,7 +89,9 @@ class Programme(Table):
     colours: tuple[OtherColour, ...] = COLOURS
     referral: Referral
     numbers: PatientNumbers
-    retention: Retention = Field(default=Retention(), exclude=True)  # no part of the page
+    # Not on the wire: the page has no use for them.
+    retention: Retention = Field(default=Retention(), exclude=True)
+    exports: Exports = Field(default=Exports(), exclude=True)
 
     @model_validator(mode="after")
     def _slots_differ(self) -> Self:
