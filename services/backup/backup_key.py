@@ -15,16 +15,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import pyrage
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from device import atomic_io
 from device.errors import SpecError
 from device.user_files import read_text
 from services.errors import BackupDamaged, BackupKeyWrong
-from services.records import digested_json
+from services.records import age_encryption, digested_json
+from services.records.age_encryption import PublicKey
 
 KEY_FILE = "backup.json"
 HEADER_FILES = (KEY_FILE, "backup-copy.json")  # in a folder of backups: without the header no passphrase helps
@@ -32,14 +33,6 @@ SEAL_BYTES = hashlib.sha256().digest_size
 MIN_PASSPHRASE = 8  # characters; scrypt makes each guess cost about a second
 
 Model = TypeVar("Model", bound=BaseModel)
-
-
-def _public_key(value: str) -> str:
-    try:
-        pyrage.x25519.Recipient.from_str(value)
-    except pyrage.RecipientError as error:
-        raise ValueError(f"{value!r:.80} is no public key of age") from error
-    return value
 
 
 class SecretKey:
@@ -88,14 +81,12 @@ class BackupHeader(BaseModel):
 
     format: Literal[1] = 1
     id: str = Field(pattern=r"^[0-9a-f]{8}$")
-    recipients: tuple[Annotated[str, AfterValidator(_public_key)], ...] = Field(min_length=1)
+    recipients: tuple[PublicKey, ...] = Field(min_length=1)
     sealed_identity: str = ""
 
     def encrypted(self, content: bytes) -> bytes:
         """Return content that only the holder of the secret key or of the passphrase can decrypt."""
-        recipients = [pyrage.x25519.Recipient.from_str(recipient) for recipient in self.recipients]
-        encrypted: bytes = pyrage.encrypt(content, recipients)
-        return encrypted
+        return age_encryption.encrypted(content, self.recipients)
 
 
 class LastBackup(BaseModel):

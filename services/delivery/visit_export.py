@@ -7,10 +7,11 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 
 from services.imaging.picture_files import with_note
+from services.records import age_encryption
 from services.records.answers import IDENTIFIERS
 from services.records.capture import COLOUR, RecordOrigin
 from services.records.capture_store import CaptureStore
@@ -19,6 +20,7 @@ from services.records.json_values import JsonObject
 from services.records.visit import Visit
 from services.records.visit_document import visit_document
 
+ENCRYPTED_NAME = "visit.zip.age"
 EARLIEST_ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # earliest date of a ZIP entry
 
 
@@ -94,6 +96,12 @@ def _report(store: CaptureStore, id: str) -> bytes:
 def folder_name(visit: Visit) -> str:
     """Return the folder name of an export: patient number and visit id."""
     return f"{visit.number}-{visit.id}"
+
+
+def encrypted_copy(visit: Visit, files: Mapping[str, bytes], recipients: Sequence[str]) -> dict[str, bytes]:
+    """Return the only file of an encrypted copy by name: the ZIP archive, encrypted to public keys of age."""
+    archive = zip_archive(folder_name(visit), files, visit.begun_at)
+    return {ENCRYPTED_NAME: age_encryption.encrypted(archive, recipients)}
 
 
 def zip_archive(name: str, files: Mapping[str, bytes], begun_at: datetime) -> bytes:

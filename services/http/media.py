@@ -43,6 +43,12 @@ class ZipResponse(Response):
     media_type = "application/zip"
 
 
+class AgeResponse(Response):
+    """A file that is encrypted to public keys of age; the format has no registered media type."""
+
+    media_type = "application/octet-stream"
+
+
 class TextResponse(Response):
     """A text; Starlette adds the character set to the media type."""
 

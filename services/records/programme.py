@@ -1,4 +1,4 @@
-"""Screening programme, read from a TOML file: picture slots, retakes, reasons, rules of referral, patient numbers."""
+"""Screening programme, read from a TOML file: picture slots, reasons, referral, numbers, retention, exports."""
 
 from pathlib import Path
 from typing import Literal, Self, get_args
@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from device.config.toml_file import Table, load_toml
 from device.values import EYES, Eye
 from services.errors import RecordNotFound
+from services.records.age_encryption import PublicKey
 from services.records.capture import OtherColour
 from services.records.capture_target import COLOURS, FRAMES
 
@@ -48,6 +49,30 @@ class PatientNumbers(Table):
     device_in_number: bool = True
 
 
+class Retention(Table):
+    """Days after the last visit for which data of a patient are kept, 1 to 36500; without a number, always.
+
+    `raw_days`: raw frames. `pictures_days`: pictures. `identity_days`: identifying fields and patient number.
+    """
+
+    raw_days: int | None = Field(default=None, ge=1, le=36500)
+    pictures_days: int | None = Field(default=None, ge=1, le=36500)
+    identity_days: int | None = Field(default=None, ge=1, le=36500)
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        given = [days for days in (self.raw_days, self.pictures_days, self.identity_days) if days is not None]
+        if given != sorted(given):
+            raise ValueError("keep raw frames no longer than pictures, and pictures no longer than the identity")
+        return self
+
+
+class Exports(Table):
+    """Encryption of exports: `recipients`, public keys of age; without one they are not encrypted."""
+
+    recipients: tuple[PublicKey, ...] = ()
+
+
 class Programme(Table):
     """Screening programme: picture slots in their order, permitted reasons why a picture is not possible, rules.
 
@@ -64,6 +89,9 @@ class Programme(Table):
     colours: tuple[OtherColour, ...] = COLOURS
     referral: Referral
     numbers: PatientNumbers
+    # Not on the wire: the page has no use for them.
+    retention: Retention = Field(default=Retention(), exclude=True)
+    exports: Exports = Field(default=Exports(), exclude=True)
 
     @model_validator(mode="after")
     def _slots_differ(self) -> Self:

@@ -27,3 +27,7 @@ def check(file: Annotated[Path, typer.Argument(help="Programme file, as TOML.")]
     typer.echo(
         f"referral: vision below {programme.referral.vision_limit}; numbers begin with {programme.numbers.prefix}"
     )
+    rules = programme.retention.model_dump(exclude_none=True)
+    kept = ", ".join(f"{rule.removesuffix('_days')} {days}" for rule, days in rules.items())
+    typer.echo(f"retention, in days after the last visit: {kept or 'no rule'}")
+    typer.echo(f"exports: encrypted to {', '.join(programme.exports.recipients) or 'no key, plain'}")

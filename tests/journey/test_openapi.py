@@ -89,7 +89,7 @@ FILES = {  # operations whose answer is no JSON, with its media types
     "GET /api/preview": {"image/jpeg"},
     "GET /api/calibration/preview": {"image/jpeg"},
     "GET /api/events": {"text/event-stream"},
-    "GET /api/visits/{id}/export.zip": {"application/zip"},
+    "GET /api/visits/{id}/export.zip": {"application/zip", "application/octet-stream"},
     "GET /api/visits/{id}/montage/{eye}/picture.png": {"image/png"},
     "GET /api/technician/event-log.txt": {"text/plain"},
     "GET /api/technician/captures/{id}/again.png": {"image/png"},

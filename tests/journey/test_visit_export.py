@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pyrage
 import pytest
 
 from services.delivery.usb_drives import UsbDrives, copy_to_drive
 from services.delivery.visit_export import zip_archive
 from services.errors import UsbDriveFull, UsbDriveReadOnly, UsbDriveUnavailable
 from services.http.app import create_app
+from services.records.audit_log import AuditLog
+from services.records.programme import Exports, load_programme
 from tests.journey.conftest import drive_id
 
 keys = (f"{number:016x}" for number in count(1))
@@ -69,6 +72,34 @@ def test_the_zip_holds_pictures_reports_and_valid_checksums_and_no_identifying_f
     assert exported["slots"] == visit["slots"]
     for secret in (b"Meena", b"Nowhere", b"12345"):
         assert secret not in answer.content
+
+
+@pytest.mark.parametrize("is_encrypted", [False, True])
+def test_an_export_is_encrypted_to_the_keys_of_the_programme_and_the_audit_log_names_it(
+    rig: Any, visit: Any, stick: Path, drives: UsbDrives, tmp_path: Path, is_encrypted: bool
+) -> None:
+    """Download and copy hold the plain archive, which the holder of the secret key only can read."""
+    number, at = f"{visit['number']}-{visit['id']}", f"/api/visits/{visit['id']}/export"
+    plain = rig.request("GET", f"{at}.zip").content
+    identity, log = pyrage.x25519.Identity.generate(), AuditLog(tmp_path, b"k" * 32, rig.clock)
+    exports = Exports(recipients=(str(identity.to_public()),) if is_encrypted else ())
+    programme = load_programme().model_copy(update={"exports": exports})
+    rig.application = create_app(rig.arbiter, rig.authenticator, programme, usb_drives=drives, audit_log=log)
+    loaded = rig.request("GET", f"{at}.zip")
+    copied = rig.request("POST", at, json={"key": next(keys), "folder": drive_id(stick)}).json()
+    files = {path.name: path.read_bytes() for path in (stick.parent / copied["folder"]).iterdir()}
+    fields = [entry.more["field"] for entry in log.entries(9, action="export")]
+    if is_encrypted:
+        assert loaded.headers["content-type"] == "application/octet-stream"
+        assert loaded.headers["content-disposition"] == f'attachment; filename="{number}.zip.age"'
+        assert set(files) == {"visit.zip.age"}
+        assert [pyrage.decrypt(content, [identity]) for content in (loaded.content, *files.values())] == [plain] * 2
+        with pytest.raises(pyrage.DecryptError):
+            pyrage.decrypt(loaded.content, [pyrage.x25519.Identity.generate()])
+    else:
+        assert loaded.content == plain
+        assert "visit.json" in files
+    assert fields == ["encrypted" if is_encrypted else "plain"] * 2
 
 
 def test_a_date_before_1980_does_not_fail_the_zip() -> None:
