@@ -587,7 +587,11 @@ COMMANDS = {  # commands that write pictures; the others print, draw plots, or m
     "run",
 }
 OTHER_COMMANDS = {
+    "label",
+    "audit archive",
     "audit verify",
+    "erase patient",
+    "erase verify",
     "programme check",
     "users add",
     "users list",

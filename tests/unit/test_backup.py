@@ -106,15 +106,15 @@ def test_a_new_device_shows_what_the_old_one_showed(store: Path, stick: Path, tm
 def test_every_file_of_the_store_is_restored_bit_for_bit(
     store: Path, stick: Path, tmp_path: Path, key: BackupKey
 ) -> None:
+    """But for the tables, into which the doses of the device are carried, and their second copy, which follows them."""
     write_backup(store, stick, CLOCK, quiet, key)
     restored_from(stick, tmp_path / "new")
+    replaced = ("store.sqlite", "dose-ledger.log", ".lock", "snapshots")
 
     def files(folder: Path) -> dict[str, tuple[bytes, int]]:
         paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
         found = {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mode) for path in paths}
-        return {
-            name: file for name, file in found.items() if not name.startswith(("store.sqlite", ".lock", "snapshots"))
-        }
+        return {name: file for name, file in found.items() if not name.startswith(replaced)}
 
     assert files(tmp_path / "new") == files(store) | {"backup.json": files(tmp_path / "new")["backup.json"]}
     assert read_key(tmp_path / "new") == key
