@@ -17,6 +17,7 @@ from typing import Any
 from device.sim.world import World
 from device.values import BatteryState
 from services.delivery.upload_worker import UploadWorker
+from services.http.control_lease import LEASE_S
 from tests.journey.asking import (
     MAKE_WEEKS,
     MAX_BYTES,
@@ -411,6 +412,7 @@ def repair(rig: Rig) -> None:
     world = rig.world
     world.faults.clear()
     world.temperature_c, world.battery_state = 25.0, BatteryState(0.775, 3.88)
+    rig.clock.elapsed_s += LEASE_S  # no screen holds the camera any more
     wait_until_idle(rig)
     until(lambda: not rig.exam.calibration_monitor.has_pending, 120)
     for alert in rig.request("GET", "/api/status").json()["standing"]:

@@ -72,6 +72,8 @@ from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
 from services.records.capture_store import CaptureStore
 from services.records.capture_target import CaptureTarget
+from services.records.programme import load_programme
+from services.records.visit_repository import VisitRepository
 from tests.journey.conftest import SMALL_HEAD
 
 ROUNDS, ROUND_S, BUDGET_S = 4, 0.3, 5.0
@@ -290,6 +292,7 @@ class Bench:
     world: WatchedWorld
     calibration: Calibration
     store: CaptureStore
+    visit: str
     conditions: Conditions
     number: int = 0
 
@@ -519,7 +522,7 @@ class Run:
         before = self.requests.snapshot
         future: Future[Capture] = Future()
         future.set_running_or_notify_cancel()
-        target = CaptureTarget(visit="v", slot=f"{action.eye}-centre", permit=self._permit)
+        target = CaptureTarget(visit=self.bench.visit, slot=f"{action.eye}-centre", permit=self._permit)
         try:
             self.lease.acquire_or_refuse(action.screen)
             accepted = self.requests.press(Press(future, action.eye, target, key), None)
@@ -589,7 +592,9 @@ class Sequences:
                 free_bytes=lambda _: 0 if conditions.is_disk_full else 10**9,
             )
         )
-        return Bench(*self.template, store, conditions)
+        programme = load_programme()
+        visit = VisitRepository(store.engine, programme, VirtualClock()).begin("0" * 16).id
+        return Bench(*self.template, store, visit, conditions)
 
 
 @contextmanager
