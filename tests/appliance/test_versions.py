@@ -25,9 +25,17 @@ HASTY = "EXAM_S = 600.0", "EXAM_S = 1.0"  # ten minutes after a picture are too 
 PYTHON = "/opt/diffuscope/.venv/bin/python"
 DIFFUSCOPE = "/opt/diffuscope/.venv/bin/diffuscope"
 PRESS = """\
-import urllib.request as u
+import time, urllib.error, urllib.request as u
 body = '{"eye": "OD"}'.encode()
-print(u.urlopen(u.Request("http://127.0.0.1:8000/api/captures", body, {"Content-Type": "application/json"})).status)
+press = u.Request("http://127.0.0.1:8000/api/captures", body, {"Content-Type": "application/json"})
+for _ in range(20):  # a health check holds the camera until two seconds after its picture
+    try:
+        print(u.urlopen(press).status)
+        break
+    except urllib.error.HTTPError as refused:
+        if refused.code != 409:
+            raise
+        time.sleep(1)
 """
 
 # Without a user, whom the device's own screen does not need while its head is simulated.

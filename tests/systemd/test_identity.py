@@ -156,7 +156,8 @@ def test_the_certificate_follows_an_address_and_only_its_group_reads_it(board: B
         assert machine.run("stat", "-c", "%a", "/run/diffuscope-tls").strip() == "2750"
         console = machine.run("cat", "/run/issue.d/diffuscope-setup.issue")
         assert console.split()[-1].replace("-", "") == machine.run("cat", "/run/diffuscope-tls/setup-code").split()[0]
-        words = ["connection", "add", "type", "dummy", "ifname", "cable", "ip4", "192.168.77.5/24"]
-        machine.run("nmcli", *words)  # NetworkManager calls address-change
+        for end, other, host in (("cable", "far", 5), ("far", "cable", 6)):  # NetworkManager calls address-change
+            words = ["type", "veth", "ifname", end, "peer", other, "ip4", f"192.168.77.{host}/24"]
+            machine.run("nmcli", "connection", "add", *words)
         machine.until(lambda: "192.168.77.5" in addresses(machine.run("cat", server)))
         assert "PRIVATE KEY" not in machine.run("cat", "/run/diffuscope-tls/authority.crt")
