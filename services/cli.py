@@ -172,6 +172,7 @@ def label(
     from services.identity.apply_at_boot import Computer
     from services.identity.label import pairing_label
     from services.identity.renewal import OUTPUT
+    from services.records.storage_errors import storage_errors
 
     computer = Computer()
     folder = data or _default_data()
@@ -179,7 +180,8 @@ def label(
     if data is None and (computer.root / OUTPUT).exists():  # the units of systemd/ are installed
         stored = computer.data if computer.data.exists() else Path("/etc/diffuscope")
         folders = Path("/var/lib/diffuscope"), stored / "identity", computer.root / OUTPUT
-    typer.echo(pairing_label(*folders, pairing_port, SystemClock()))
+    with storage_errors():
+        typer.echo(pairing_label(*folders, pairing_port, SystemClock()))
 
 
 def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs: tuple[Path, ...]) -> InstrumentSpec:

@@ -262,6 +262,7 @@ def access() -> list[dict[str, Any]]:
         _users(log)
         log.ask("GET /api/audit", "/api/audit?action=sign-in&limit=2")
         _clock(log)
+        _erasure(log)
         log.ask("POST /api/login/activity")
         log.ask("POST /api/login/confirm", json={"secret": "000000"})
         device.clock.elapsed_s += 2
@@ -295,6 +296,16 @@ def _clock(log: Transcript) -> None:
     log.ask("POST /api/clock", json=log.key(**earlier), note="before the time of the device")
     log.ask("POST /api/clock", json=log.key(**later))
     log.ask("POST /api/clock/back", json=log.key(**earlier))
+
+
+def _erasure(log: Transcript) -> None:
+    """Record the erasure of a patient by an administrator."""
+    log.ask("POST /api/visits", json=log.key(number="X1"))
+    log.ask("GET /api/patients", "/api/patients?number=X2")
+    log.ask("GET /api/patients", "/api/patients?number=X1")
+    log.ask("POST /api/patients/erase", json={"number": "X2", "reason": "requested"})
+    log.ask("POST /api/patients/erase", json={"number": "X1", "reason": "requested"})
+    log.ask("GET /api/patients", "/api/patients?number=X1", note="erased")
 
 
 def _users(log: Transcript) -> None:

@@ -17,8 +17,10 @@ const REQUESTS = {
   forgotten: ["POST", "/api/setup"],
   own: ["PUT", "/api/login/secret"],
 };
-const CODE_OF_LABEL = new URLSearchParams(location.hash.slice(1)).get("code") ?? ""; // before the router replaces it
-const HAS_CANCEL = ["access.confirm", "own"]; // over the page of a user who is signed in
+// Read before the router replaces the fragment.
+const CODE_OF_LABEL = new URLSearchParams(location.hash.slice(1)).get("code") ?? "";
+// These are over the page of a user who is signed in.
+const HAS_CANCEL = ["access.confirm", "own"];
 
 class UserLogin extends HTMLElement {
   /** @type {Asking} */
@@ -38,7 +40,8 @@ class UserLogin extends HTMLElement {
   }
 
   #ask(code) {
-    if (this.#state.code === code || this.#state.code === "forgotten") return; // the page behind asks again and again
+    // The page behind asks again and again.
+    if ([code, "forgotten"].includes(this.#state.code)) return;
     this.#set({ code, name: this.#state.name || (knownNames()[0] ?? ""), error: "" });
     if (!this.#dialog.open) this.#dialog.showModal();
     this.#focus();
@@ -101,7 +104,7 @@ class UserLogin extends HTMLElement {
 
 customElements.define("user-login", UserLogin);
 
-const TITLES = { "access.setup": "login.setup", forgotten: "login.forgotten", "access.confirm": "login.confirm", own: "login.own" };
+const TITLES = { "access.setup": "login.setup", "access.confirm": "login.confirm" };
 
 /** @param {Asking} state */
 function view({ code, name, error, busy }, actions) {
@@ -111,7 +114,7 @@ function view({ code, name, error, busy }, actions) {
   const hasCancel = HAS_CANCEL.includes(code);
   return html`<dialog class="login" aria-labelledby="login-title" @cancel=${actions.cancel}>
     <form @submit=${actions.submit} autocomplete="off">
-      <h2 id="login-title">${icon("person")} ${t(TITLES[code] ?? "login.title")}</h2>
+      <h2 id="login-title">${icon("person")} ${t(TITLES[code] ?? (isOwn || isForgotten ? `login.${code}` : "login.title"))}</h2>
       ${isSetup ? html`<p>${t("login.setup.why")} ${isForgotten ? t("login.forgotten.how") : ""}</p>${field("code", t("login.code"), "text", CODE_OF_LABEL)}` : nothing}
       ${hasCancel ? nothing : names(name, isSetup ? [] : knownNames(), actions)}
       ${field("secret", t(isSetup ? "login.new" : isOwn ? "login.old" : "login.pin"), "password")}

@@ -135,7 +135,8 @@ const pictureActions = {
   },
 
   async pictureFault({ detail }) {
-    if (detail.mark === "quick") return; // the final picture is still to come
+    // The final picture is still to come.
+    if (detail.mark === "quick") return;
     const why = FILE_FAULTS[await fileErrorCode(detail.url)] ?? "fault.picture";
     raiseAlert({ code: "picture", message: t(why), remedy: t(`${why}.remedy`), from: "press" });
   },
