@@ -140,7 +140,7 @@ def test_a_forgotten_pin_is_replaced_with_the_code(own_server: Server, open_page
     assert faults(page) == []
     dialog.locator("[name=secret]").fill("000000")
     dialog.locator("#forgotten").tap()
-    expect(dialog).to_contain_text("hold the button of the camera")
+    expect(dialog).to_contain_text("hold the camera's button")
     expect(dialog.locator("[name=secret]")).to_have_value("")
     assert faults(page) == []
     page.keyboard.press("Escape")
