@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from device import atomic_io
+from device.clock import SystemClock
 from services.errors import RecordNotFound
-from services.identity.audit_key import find_audit_key
+from services.identity.audit_key import find_audit_key, load_or_create_audit_key
+from services.records.audit_log import AuditLog
 from services.running_time import announced, announcing, say
 
 if TYPE_CHECKING:
@@ -69,9 +71,11 @@ def copy(
 
     if not (data / "captures").is_dir():
         raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
-    with CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
+    key = load_or_create_audit_key(data)
+    with CaptureStore(data, key=key) as store, storage_errors():
         atomic_io.make_folder(output)
         for id in capture:
+            AuditLog(data, key, SystemClock()).append("", "copy", id, field="plain", by="command")
             atomic_io.write_folder(output / id, {name: store.read(id, name) for name in store.get(id).files})
     typer.echo(f"{output}: {len(capture)} captures")
 
