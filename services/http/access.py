@@ -63,6 +63,8 @@ ACCESS: dict[str, Access] = {
     "POST /api/users": USERS,
     "PATCH /api/users/{name}": USERS,
     "DELETE /api/users/{name}": USERS,
+    "GET /api/ssh-keys": ADMINISTRATION,
+    "POST /api/ssh-keys": USERS,
     "GET /api/openapi.json": ANY_USER,
     "GET /api/audit": ADMINISTRATION,
     "GET /api/status": MONITORED,
