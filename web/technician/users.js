@@ -1,15 +1,15 @@
-// <instrument-users>: the administrator's list of users: add, roles, new PIN, remove.
+// <instrument-users>: the administrator's list of users (add, roles, new PIN, remove), and the keys for SSH of the card.
 
 import { sentences } from "../core/api.js";
 import { askIfRequired } from "../core/login.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
 
-const URL = "/api/users";
+const URL = "/api/users", KEYS = "/api/ssh-keys";
 const ROLES = ["screener", "reader", "technician", "administrator"];
 
 class InstrumentUsers extends HTMLElement {
-  #state = { users: /** @type {any[] | null} */ (null), open: "", error: "", message: "" };
+  #state = { users: /** @type {any[] | null} */ (null), keys: [], open: "", error: "", message: "" };
   #reload = () => this.#load();
 
   connectedCallback() {
@@ -27,15 +27,16 @@ class InstrumentUsers extends HTMLElement {
   }
 
   async #load() {
-    const answer = await this.#request("GET", "");
-    if (answer) this.#set({ users: answer.users });
+    const answer = await this.#request("GET", URL);
+    const asked = answer && (await this.#request("GET", KEYS));
+    if (asked) this.#set({ users: answer.users, keys: asked.keys });
   }
 
   /** Return the answer to a request, null after a refusal, which is shown; a missing login is asked for. */
-  async #request(method, path, body = undefined) {
+  async #request(method, url, body = undefined) {
     const options = { method, cache: /** @type {const} */ ("no-store") };
     if (body) Object.assign(options, { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-    const response = await fetch(`${URL}${path}`, options).catch(() => null);
+    const response = await fetch(url, options).catch(() => null);
     const answer = await response?.json().catch(() => null);
     if (response?.ok && answer) return answer;
     const isAsked = answer?.code && askIfRequired(answer);
@@ -43,8 +44,8 @@ class InstrumentUsers extends HTMLElement {
     return null;
   }
 
-  async #change(method, path, body, message) {
-    if (!(await this.#request(method, path, body))) return;
+  async #change(method, url, body, message) {
+    if (!(await this.#request(method, url, body))) return;
     this.#set({ open: "", error: "", message });
     await this.#load();
   }
@@ -55,16 +56,17 @@ class InstrumentUsers extends HTMLElement {
     add: (event) => {
       event.preventDefault();
       const { name, secret, roles } = typed(event.target);
-      this.#change("POST", "", { name, secret, roles }, t("users.added", { name }));
+      this.#change("POST", URL, { name, secret, roles }, t("users.added", { name }));
     },
 
     save: (event, name) => {
       event.preventDefault();
       const { secret, roles } = typed(event.target);
-      this.#change("PATCH", `/${encodeURIComponent(name)}`, { roles, ...(secret && { secret }) }, t("users.saved", { name }));
+      this.#change("PATCH", `${URL}/${encodeURIComponent(name)}`, { roles, ...(secret && { secret }) }, t("users.saved", { name }));
     },
 
-    remove: (name) => this.#change("DELETE", `/${encodeURIComponent(name)}`, undefined, t("users.removed", { name })),
+    remove: (name) => this.#change("DELETE", `${URL}/${encodeURIComponent(name)}`, undefined, t("users.removed", { name })),
+    decide: (fingerprint, confirmed) => this.#change("POST", KEYS, { fingerprint, confirmed }, t("ssh.decided")),
     differ: () => this.#set({ error: t("login.differ"), message: "" }),
   };
 }
@@ -76,13 +78,14 @@ function typed(form) {
   return { name: String(data.get("name") ?? ""), secret: String(data.get("secret")), roles: data.getAll("role") };
 }
 
-function view({ users, open, error, message }, actions) {
+function view({ users, keys, open, error, message }, actions) {
   return html`
     <h2>${t("section.users")}</h2>
     ${error ? html`<p class="bad" role="alert">${error}</p>` : nothing}
     <p role="status">${message}</p>
     <ul class="users">${(users ?? []).map((user) => row(user, open === user.name, actions))}</ul>
     ${users ? form("", null, actions) : nothing}
+    ${keys.length ? html`<h3>${t("ssh.title")}</h3><p>${t("ssh.about")}</p>${keys.map((key) => sshKey(key, actions))}` : nothing}
   `;
 }
 
@@ -93,6 +96,15 @@ function row(user, isOpen, actions) {
     </button>
     ${isOpen ? form(user.name, user, actions) : nothing}
   </li>`;
+}
+
+function sshKey({ fingerprint, comment, confirmed }, { decide }) {
+  const state = confirmed === null ? "ssh.asked" : confirmed ? "ssh.confirmed" : "ssh.refused";
+  return html`<div class="card">
+    <p><b>${comment}</b> <code>${fingerprint}</code>: ${t(state)}</p>
+    <button type="button" @click=${() => decide(fingerprint, true)}>${t("ssh.confirm")}</button>
+    <button type="button" @click=${() => decide(fingerprint, false)}>${t("ssh.refuse")}</button>
+  </div>`;
 }
 
 /** Form of a new user, or of the roles and a new PIN of a known one; the PIN is typed twice. */

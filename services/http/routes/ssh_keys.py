@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request
 
 from services.errors import RecordNotFound
 from services.http.authentication import Peer, check_presence
-from services.http.schemas.ssh_keys import SshKeyAnswer, SshKeyDecision, SshKeyList
+from services.http.schemas.access import SshKeyAnswer, SshKeyDecision, SshKeyList
 from services.identity import ssh_keys
 from services.identity.apply_settings import OUTPUT
 from services.records import schema

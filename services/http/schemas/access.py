@@ -1,4 +1,4 @@
-"""Bodies of the endpoints of sign-in, set-up and users."""
+"""Bodies of the endpoints of sign-in, set-up, users and keys for SSH."""
 
 from pydantic import Field
 
@@ -66,3 +66,24 @@ class UserList(ResponseBody):
     """All users, in the order of their names."""
 
     users: list[UserAnswer]
+
+
+class SshKeyDecision(RequestBody):
+    """Request body: the key with this fingerprint may log in, or not."""
+
+    fingerprint: str = Field(max_length=80)
+    confirmed: bool
+
+
+class SshKeyAnswer(ResponseBody):
+    """A key: SHA-256 fingerprint, comment, and whether it is confirmed (false: refused; null: no decision)."""
+
+    fingerprint: str
+    comment: str
+    confirmed: bool | None
+
+
+class SshKeyList(ResponseBody):
+    """Keys for SSH in the file of the card, in its order."""
+
+    keys: list[SshKeyAnswer]
