@@ -7,6 +7,7 @@ No Raspberry Pi and no package archive is needed; checks with the real programs 
 import configparser
 import os
 import re
+import shlex
 import subprocess
 from pathlib import Path
 
@@ -131,6 +132,18 @@ def test_unfinished_root_is_not_removed_through_a_mount(tmp_path: Path, is_busy:
     assert root.exists() is is_busy
     assert ("still mounted" in done.stderr) is is_busy, done.stderr
     assert done.returncode == is_busy
+
+
+def test_the_data_partition_of_a_card_is_encrypted_by_default(tmp_path: Path) -> None:
+    """The boot of a board without a key in its fuses ends with a sentence, instead of a readable partition."""
+    assert metadata("layer/diffuscope.yaml")["X-Env-Var-encrypt"] == "y"
+    unit = configparser.ConfigParser(interpolation=None, delimiters="=", strict=False)
+    unit.read_string(text(f"{CARD}/luks/diffuscope-key.service"))
+    command = unit["Service"]["ExecStart"].replace("rpi-fw-crypto hmac", "false").replace("/run/", f"{tmp_path}/")
+    stopped = subprocess.run(shlex.split(command), capture_output=True, text=True, check=False)
+    assert stopped.returncode == 1
+    assert "burn one" in stopped.stderr
+    assert not (tmp_path / "diffuscope-key").exists()
 
 
 def test_layer_hooks_name_existing_scripts_and_variables() -> None:
