@@ -1,4 +1,4 @@
-"""Command `diffuscope store check|rebuild|copy`: check all that is stored, rebuild the database, copy captures."""
+"""Command `diffuscope store check|rebuild|copy|research`: check what is stored, rebuild its database, copy captures."""
 
 import json
 import sys
@@ -10,6 +10,7 @@ import typer
 
 from device import atomic_io
 from device.clock import SystemClock
+from device.user_files import files_in
 from services.errors import RecordNotFound
 from services.identity.audit_key import find_audit_key, load_or_create_audit_key
 from services.records.audit_log import AuditLog
@@ -78,6 +79,33 @@ def copy(
             AuditLog(data, key, SystemClock()).append("", "copy", id, field="plain", by="command")
             atomic_io.write_folder(output / id, {name: store.read(id, name) for name in store.get(id).files})
     typer.echo(f"{output}: {len(capture)} captures")
+
+
+@app.command()
+@announced("writing the research export")
+def research(
+    data: Data,
+    output: Annotated[Path, typer.Option("--output", "-o", help="New folder, which gets a folder for each visit.")],
+) -> None:
+    """Copy all finished visits with consent for research, without number, name, phone, village and dates.
+
+    They are still pictures of persons: a retina identifies a person of whom another picture is known.
+    """
+    from services.delivery.research_export import research_folders  # deferred: imports SQLAlchemy
+    from services.records.capture_store import CaptureStore
+    from services.records.storage_errors import storage_errors
+
+    if output.exists():
+        raise typer.BadParameter(f"{output} exists; give a new folder")
+    if not (data / "captures").is_dir():
+        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    key = load_or_create_audit_key(data)
+    AuditLog(data, key, SystemClock()).append("", "export-research", by="command")
+    with CaptureStore(data, key=key) as store, storage_errors():
+        atomic_io.make_folder(output)
+        for name, files in research_folders(store):
+            atomic_io.write_folder(output / name, files)
+    typer.echo(f"{output}: {len(files_in(output))} visits")
 
 
 def table(results: list["Checked"]) -> str:

@@ -141,6 +141,8 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "store check --data {0}/none",
     "store rebuild --data {0}/none --yes",
     "store copy x --data {0}/none -o {0}/none-copied",
+    "store research --data {0}/none -o {0}/none-research",
+    "store research --data {0}/none -o {0}",
     "store backup --to {0}/none --data {0}/none",
     "store restore --from {0}/none --data {0}/none",
     "update",

@@ -8,20 +8,29 @@ import sys
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pyrage
 import pytest
+from PIL import Image
+from typer.testing import CliRunner
 
+from services.cli import app
 from services.delivery.usb_drives import UsbDrives, copy_to_drive
 from services.delivery.visit_export import zip_archive
 from services.errors import UsbDriveFull, UsbDriveReadOnly, UsbDriveUnavailable
 from services.http.app import create_app
+from services.identity.audit_key import read_audit_key
+from services.imaging.picture_files import read_raw_tiff
 from services.records.audit_log import AuditLog
+from services.records.device_identity import load_or_create_device
+from services.records.patient_rows import patient_of_visit
 from services.records.programme import Exports, load_programme
 from tests.journey.conftest import drive_id
 
@@ -106,6 +115,51 @@ def test_an_export_is_encrypted_to_the_keys_of_the_programme_and_the_audit_log_n
         assert loaded.content == plain
         assert "visit.json" in files
     assert fields == ["encrypted" if is_encrypted else "plain"] * 2
+
+
+def test_a_research_export_names_no_patient_and_keeps_the_mark_of_a_simulation(
+    rig: Any, visit: Any, tmp_path: Path
+) -> None:
+    """Byte search over all files, after decompression: number, name, phone, village, ids, dates; texts of pictures."""
+    at, data, out = f"/api/visits/{visit['id']}", rig.store.folder, tmp_path / "research"
+    for field, value in {"age": 97, "drops_od": "2026-03-01T11:40:00Z"}.items():
+        rig.request("PATCH", at, json={"key": next(keys), "field": field, "value": value})
+    outcome = rig.request("POST", f"{at}/finish", json={"key": next(keys)}).json()["outcome"]["code"]
+    patient_id = patient_of_visit(rig.store.engine, visit["id"])
+    captures = visit["slots"]["R-centre"]["captures"]
+    raws = [read_raw_tiff(rig.store.read(id, "raw.tiff")) for id in captures]
+    device = load_or_create_device(data)
+    words = ["store", "research", "--data", str(data), "-o", str(out)]
+    CliRunner().invoke(app, words, catch_exceptions=False)
+    (folder,) = out.iterdir()
+    assert json.loads((folder / "visit.json").read_text()) == {
+        "year": rig.clock.wall().year,
+        "fields": {"age": 90},
+        "outcome": outcome,
+    }
+    day = rig.clock.wall()
+    dates = [f"{day:%Y-%m-%d}", f"{day:%Y%m%d}", f"{day:%Y:%m:%d}", "2026-03-01", "11:40"]
+    secrets = ["Meena", "Nowhere", "Elsewhere", "12345", visit["number"], visit["id"], patient_id, *captures, *dates]
+    secrets += [device.prefix, device.uuid, device.serial]
+    contents = {path.name: path.read_bytes() + str(path.relative_to(out)).encode() for path in folder.iterdir()}
+    for path in folder.glob("*.png"):
+        with Image.open(path) as image:
+            contents[path.name] += repr(image.info).encode()
+            assert "simulated" in image.info
+    found = [(name, one) for name, content in contents.items() for one in secrets if one.encode() in content]
+    assert found == []
+    for number, (counts, metadata) in enumerate(raws, 1):
+        kept, texts = read_raw_tiff((folder / f"{number}-raw.tiff").read_bytes())
+        assert np.array_equal(kept, counts)
+        assert texts == replace(metadata, id=None, taken_at=None, head=None)
+        assert (texts.simulated, texts.calibration_id) == (True, metadata.calibration_id)
+        report = json.loads((folder / f"{number}-report.json").read_text())
+        assert (report["eye"], report["slot"], report["simulated"]) == ("OD", "R-centre", True)
+    (entry,) = AuditLog(data, read_audit_key(data), rig.clock).entries(9, action="export-research")
+    assert entry.more == {"by": "command"}
+    assert CliRunner().invoke(app, words).exit_code == 2, "a second one would mix the pseudonyms"
+    CliRunner().invoke(app, [*words[:-1], str(tmp_path / "again")], catch_exceptions=False)
+    assert [path.name for path in (tmp_path / "again").iterdir()] != [folder.name]
 
 
 def test_a_date_before_1980_does_not_fail_the_zip() -> None:

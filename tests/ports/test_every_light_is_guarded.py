@@ -97,6 +97,7 @@ WITHOUT_HEAD = {  # files, stores, simulated scenes: no part of a head is opened
     "store check",
     "store rebuild",
     "store copy",
+    "store research",
     "store backup",
     "store restore",
     "archive plan",

@@ -469,6 +469,8 @@ WRITERS = {
     "device/config/marked_files.py write_npy": "test_reconstruct",
     "device/sim/scene_files.py _write_vessels": "test_simulate_and_frame",
     "device/sim/scene_files.py write": "test_simulate_and_frame",
+    "services/delivery/research_export.py _anonymised": "tests/journey/test_visit_export.py::"
+    "test_a_research_export_names_no_patient_and_keeps_the_mark_of_a_simulation",
     "services/delivery/visit_export.py _picture": "test_export_after_a_correction_of_the_eye",
     "services/imaging/picture_files.py counts_jpeg": "test_live_picture_of_a_calibration",
     "services/imaging/picture_files.py raw_tiff": CAPTURE,
@@ -622,6 +624,7 @@ OTHER_COMMANDS = {
     "store check",
     "store rebuild",
     "store copy",
+    "store research",
     "store backup",
     "store restore",
     "archive plan",
