@@ -168,7 +168,7 @@ class UpdateRequests:
                 yield BundleUpload(part, file, length)
         except OSError as error:
             if not atomic_io.is_full(error):
-                raise UpdateFailed(f"the file cannot be kept: {error.strerror}") from error
+                raise UpdateFailed(f"the file cannot be saved: {error.strerror}") from error
             raise UpdateNoRoom("the disk is full") from error
         finally:
             part.unlink(missing_ok=True)

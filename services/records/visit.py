@@ -155,13 +155,13 @@ def decide_outcome(programme: Programme, fields: Mapping[str, FormValue], slots:
         return Outcome("refer_vision", f"Refer: vision of {_eyes(low_vision)} below {limit}.")
     if fields.get("consent") == "declined":
         taken = any(slot.captures for slot in slots.values())
-        kept = " to more. Those taken before are kept." if taken else " to pictures. None were taken."
+        kept = " to more. Those taken before are saved." if taken else " to pictures. None were taken."
         return Outcome("declined", f"The patient did not agree{kept}")
     if missing_phrases := _missing_pictures(programme, slots):
         return Outcome("refer_picture", f"Refer: {'; '.join(missing_phrases)}.")
     empty = sum(slot.required and slots[slot.id].state == "empty" for slot in programme.slots)
     missing = f", {empty} not taken" if empty else ""
-    return Outcome("send", f"The pictures are kept{missing}. They are for an eye specialist.")
+    return Outcome("send", f"The pictures are saved{missing}. They are for an eye doctor.")
 
 
 def _is_below(vision: FormValue, limit: Vision) -> bool:

@@ -51,7 +51,7 @@ def visit_row(session: Session, id: str) -> VisitRow:
     """Return the row of a visit; RecordNotFound if unknown, StoreDamaged if its id differs from the requested one."""
     found = session.get(VisitRow, id) if _ID.fullmatch(id) else None
     if found is None:
-        raise RecordNotFound("this visit is not kept here", "Choose the person from the list.")
+        raise RecordNotFound("this visit is not saved here", "Choose the patient from the list.")
     if found.id != id:  # the index still holds the id, the row does not
         raise StoreDamaged(f"the entry of the visit {id!r} has another name", REMEDY)
     return found

@@ -41,14 +41,14 @@ def test_home_continues_an_unfinished_visit_of_yesterday(open_page: Open, real: 
     real.clock.moved = timedelta(0)
     page = open_page(f"{real.url}/#/")
     expect(page.locator("#continue")).to_contain_text(re.compile(r"\d{4}"))  # with its day
-    expect(page.locator(".home .day")).to_contain_text("0 to finish")  # of today
+    expect(page.locator(".home .day")).to_contain_text("0 not finished")  # of today
     assert look_for_faults(page, "#continue") == []
     tap(page, "#continue")
     page.wait_for_url(re.compile(visit["id"]))
     page.goto(f"{real.url}/#/")
     real.begin_visit(consent="agreed")
     page.reload()
-    expect(page.locator(".home .day")).to_contain_text("1 to finish")
+    expect(page.locator(".home .day")).to_contain_text("1 not finished")
     expect(page.locator("#continue")).not_to_contain_text("·")
 
 
@@ -90,7 +90,7 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
     expect_face(page, "R-centre", "good")
     tap(page, "#next")
 
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     with real.poor_light("saturated"):
         take_picture(page)
     expect(page.locator(".card")).to_contain_text("Too bright. Move back a little. Take again.")
@@ -109,11 +109,11 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
         tap(page, "#again")
     take_picture(page)
     real.show(None)
-    expect(page.locator(".card")).to_contain_text("Not clear after 3 tries. That is useful to know.")
+    expect(page.locator(".card")).to_contain_text("Not clear after 3 tries. Choose “Not possible”.")
     tap(page, "#not-possible")
     faults["why"] = look_for_faults(page)
     tap(page, "[data-reason=pupil]")
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Optic disc")
     expect_face(page, "L-centre", "not_possible")
 
     take_picture(page)
@@ -166,9 +166,9 @@ def test_urgent_complaint_shows_warning(open_page: Open, real: Real) -> None:
 def test_visit_without_consent_can_only_be_finished(open_page: Open, real: Real) -> None:
     visit = real.begin_visit()
     page = open_page(f"{real.url}/#/visit/{visit['id']}/aim/R-centre")
-    expect(page.locator(".state-bar[data-code='consent.missing']")).to_contain_text("First ask: may we take pictures?")
+    expect(page.locator(".state-bar[data-code='consent.missing']")).to_contain_text("Ask the patient first.")
     after_debounce(page).locator(SHUTTER).tap(force=True)
-    expect(page.locator(SHUTTER)).to_contain_text("First ask")
+    expect(page.locator(SHUTTER)).to_contain_text("Ask the patient first")
     expect(page.locator("eye-live[data-frame]")).to_have_count(0)
     assert look_for_faults(page) == []
     tap(page, "[data-do=ask]")
@@ -189,7 +189,7 @@ def test_finish_asks_when_a_picture_is_missing(open_page: Open, real: Real) -> N
     assert real.visit()["finished_at"] is None
     assert look_for_faults(page) == []
     page.locator("#take-missing").tap()
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Optic disc")
     tap(page, "#finish")
     page.locator("#finish-without").tap()
     page.wait_for_selector(".outcome .verdict")
@@ -238,7 +238,7 @@ def test_next_press_is_allowed_after_verdict(open_page: Open, real: Real) -> Non
     page = aiming(open_page, real)
     page.locator(SHUTTER).tap()
     page.wait_for_selector("[data-phase=assessed]")
-    expect(page.locator(".card")).to_contain_text("You can go on.")
+    expect(page.locator(".card")).to_contain_text("Sharp and bright enough.")
     expect(page.locator("progress")).to_be_visible()
     tap(page, "#next")
     expect_face(page, "R-centre", "making")
@@ -258,7 +258,7 @@ def test_poor_picture_is_kept_and_older_one_selected(open_page: Open, real: Real
     tap(page, "#again")
     take_picture(page)
     tap(page, "#keep")
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     first, second = real.visit()["slots"]["R-centre"]["captures"]
     page.goto(f"{real.url}/#/visit/{visit_of(page)}/picture/R-centre/{first}")
     tap(page, "#use")
@@ -435,10 +435,10 @@ def test_control_is_taken_from_another_screen(open_page: Open, real: Real, compl
     complaints.expect(r"409 .*/api/preview")  # the next live picture of the first screen
     first = aiming(open_page, real)
     second = after_debounce(open_page(f"{real.url}/#/visit/{visit_of(first)}/aim/R-centre"))
-    expect(second.locator(SHUTTER)).to_contain_text("Other screen")
+    expect(second.locator(SHUTTER)).to_contain_text("Other tablet")
     second.locator("[data-do=useHere]").tap()
     expect(second.locator(SHUTTER)).to_contain_text("Take picture")
-    expect(first.locator(SHUTTER)).to_contain_text("Other screen")
+    expect(first.locator(SHUTTER)).to_contain_text("Other tablet")
     expect(first.locator("eye-live[data-frame]")).to_have_count(0)
 
 
@@ -465,9 +465,9 @@ def test_visit_by_shortcut_keys(open_page: Open, real: Real) -> None:
     stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     after_debounce(page).keyboard.press("n")
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     page.keyboard.press("4")
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Optic disc")
     page.keyboard.press("ArrowLeft")
     page.wait_for_selector("[data-screen=patient]")
     page.keyboard.press("?")
@@ -497,7 +497,7 @@ def test_finish_while_the_visit_is_loading_ends_nothing(open_page: Open, real: R
     page.route("**/api/visits/*", lambda route: held.append(route))  # never answered
     page.reload()
     after_debounce(page).locator("#finish").tap()
-    expect(page.locator("#finish")).to_have_text("Finish with what we have")
+    expect(page.locator("#finish")).to_have_text("Finish without the missing pictures")
     after_debounce(page)
     assert held, "it is still loading"
     assert real.visit()["finished_at"] is None

@@ -406,7 +406,7 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
         answer = refused(
             old_rig.request("POST", path, json={"key": next(keys), **body}, headers=other), 409, "link.other"
         )
-        assert answer["remedy"] == "Another screen is taking pictures."
+        assert answer["remedy"] == "Another tablet is using the camera."
         assert old_rig.request("POST", path, json={"key": next(keys), **body}, headers=mine).status_code == 201
     begin(old_rig)  # without the header: a script
     taken = post(old_rig, "/api/controller", key=other["X-Controller"], take=True)

@@ -168,8 +168,8 @@ def test_vision_at_the_limit_is_not_referred(vision: str) -> None:
         ),
         (("not_possible", "empty"), ("not_possible", "not_possible"), "Refer: picture of both eyes not possible."),
         (("taken", "taken"), ("not_possible", "empty"), "Refer: picture of the left eye not possible."),
-        (("taken", "empty"), ("taken", "taken"), "The pictures are kept, 1 not taken. They are for an eye specialist."),
-        (("taken", "taken"), ("taken", "taken"), "The pictures are kept. They are for an eye specialist."),
+        (("taken", "empty"), ("taken", "taken"), "The pictures are saved, 1 not taken. They are for an eye doctor."),
+        (("taken", "taken"), ("taken", "taken"), "The pictures are saved. They are for an eye doctor."),
     ],
 )
 def test_untaken_and_impossible_pictures_have_different_sentences(

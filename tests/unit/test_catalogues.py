@@ -63,6 +63,17 @@ def test_a_translation_has_only_master_keys_and_variables(language: str, folder:
     assert missing <= {"aim.live", "stop.other"}
 
 
+@pytest.mark.parametrize("name", ["en", "technician/en", "pairing/en"])
+def test_one_english_word_for_one_thing(name: str) -> None:
+    """Patient, picture, saved, not possible, eye doctor, macula, optic disc: never another word for the same thing."""
+    others = (
+        r"\b(person|people|kept|keeping|specialist|photos?|shot|loupe|quick look|as taken|by itself|by themselves)\b"
+        r"|^(could not|made|being made|agreed|erase|centre|nerve|to finish|dim room|daylight|hold still|complaints)$"
+        r"|\b(being made|needs set-up|setting up|first ask|enough light|another screen|has no voice|read out)\b"
+    )
+    assert {key: words for key, words in catalogue(name).items() if re.search(others, words, re.IGNORECASE)} == {}
+
+
 def test_the_pages_ask_for_texts_that_the_master_has() -> None:
     """Only keys that are written out; those that are made from a code are tried by the tests of the page."""
     shared, technician = set(by_key(ENGLISH)), set(by_key(TECHNICIAN))

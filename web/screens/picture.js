@@ -1,5 +1,5 @@
 // Picture screen: progress and result in place; the verdict comes before the final picture and selects the primary
-// button. Three verdict texts: Good, Take again, Could not.
+// button. Three verdict texts: Good, Take again, Not possible.
 
 import { icon } from "../components/icons.js";
 import { colourLink } from "../core/api.js";
