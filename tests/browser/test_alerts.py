@@ -72,7 +72,7 @@ def test_alert_table_matches_specification() -> None:
     assert states == SPECIFIED
     for words in [words for key, words in english.items() if key.startswith(("state.", "aim."))]:
         assert max(len(line.split()) for line in re.split(r"(?<=[.?…])\s", words)) <= 12
-    forbidden = r"normal|healthy|disease|retinopathy|glaucoma|cataract|macula"
+    forbidden = r"normal|healthy|disease|retinopathy|glaucoma|cataract|maculopathy"
     assert not re.findall(forbidden, " ".join(english.values()), re.IGNORECASE)
 
 
@@ -148,7 +148,7 @@ def test_light_limit_offers_other_eye(open_page: Open, real: Real) -> None:
     visit = real.begin_visit(consent="agreed")["id"]
     CAUSES["light.limit"](real, visit)
     page = after_debounce(open_page(f"{real.url}/#/visit/{visit}/aim/R-centre"))
-    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Rest it \d+ minutes\."))
+    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Wait \d+ minutes with this eye\."))
     expect(page.locator(SHUTTER)).to_contain_text(re.compile(r"Light limit: wait – \d+:\d\d"))
     page.locator("[data-do=otherEye]").tap()
     expect(page.locator(SHUTTER)).to_contain_text("Take picture")

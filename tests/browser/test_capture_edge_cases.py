@@ -277,7 +277,7 @@ def test_light_limit_offers_other_eye_only_during_exam(open_page: Open, real: Re
     CAUSES["light.limit"](real, "")
     real.wait_for_problem("light.limit")
     page = open_page(real.url)
-    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Rest it \d+ minutes"))
+    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Wait \d+ minutes with"))
     expect(page.locator("[data-do=otherEye]")).to_have_count(0)
 
 

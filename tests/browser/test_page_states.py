@@ -53,7 +53,7 @@ def test_final_picture_replaces_quick_look_and_keeps_view(open_page: Open, real:
     page = aiming(open_page, real)
     page.locator(SHUTTER).tap()
     page.wait_for_selector(".stage[data-mark=quick]")
-    expect(page.get_by_role("status")).to_contain_text("Quick look")
+    expect(page.get_by_role("status")).to_contain_text("Preview")
     bar = page.locator("progress").evaluate("bar => bar.value")
     page.get_by_role("button", name="Red-free").tap()
     page.get_by_role("button", name="Zoom in").tap()
@@ -149,7 +149,7 @@ def test_second_press_during_capture_is_ignored(open_page: Open, real: Real) -> 
     page = aiming(open_page, real)
     page.locator(SHUTTER).dblclick()
     after_debounce(page).locator(SHUTTER).tap(force=True)
-    expect(page.get_by_role("status")).to_contain_text("still being made")
+    expect(page.get_by_role("status")).to_contain_text("still being processed")
     real.hold = None
     page.wait_for_selector(".stage[data-mark=final]")
     assert real.presses == 1

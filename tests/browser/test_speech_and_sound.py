@@ -152,7 +152,7 @@ def test_tones_and_vibrations_of_capture_events(open_page: Open, real: Real) -> 
     page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     tap(page, "#shoot")
     wait_for_preview(page)
-    expect(page.locator(".prompt")).to_contain_text("No eye seen")
+    expect(page.locator(".prompt")).to_contain_text("No eye found")
     expect_tones(page)
     real.rig.world.faults.clear()
     page.wait_for_selector(".prompt[data-tone=ready]")

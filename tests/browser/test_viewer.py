@@ -490,7 +490,7 @@ def test_a_picture_is_in_colour_and_red_free_is_the_one_in_green(open_page: Open
     page.get_by_role("button", name="Details").tap()
     details = page.get_by_role("dialog")
     expect(details).to_contain_text("green, red, blue (predicted, not measured)")
-    expect(details).not_to_contain_text("one colour of light")
+    expect(details).not_to_contain_text("Black-and-white")
     for name, file in (("Picture in colour (PNG)", "colour.png"), ("Picture (PNG)", "picture.png")):
         href = details.get_by_role("link", name=name, exact=True).get_attribute("href") or ""
         assert href.endswith(f"/{file}")

@@ -212,7 +212,7 @@ def test_a_refused_field_is_shown_with_the_number_that_the_server_sent(
 
     page.route(f"**/api/visits/{visit}", refuse)
     page.locator("[data-value=man]").tap()
-    expect(page.locator(".state-bar")).to_contain_text("Rest it 4 minutes.")
+    expect(page.locator(".state-bar")).to_contain_text("Wait 4 minutes with this eye.")
     expect(page.locator("[data-value=man]")).to_have_attribute("aria-pressed", "false")
 
 
@@ -428,7 +428,7 @@ def test_visit_is_copied_to_usb_and_saved_as_zip(open_page: Open, real: Real) ->
     page.route("**/export.zip", lambda route: route.fulfill(body=b"PK", headers=name))
     with page.expect_download():
         page.get_by_role("link", name="ZIP").tap()
-    expect(page.get_by_role("note")).to_contain_text("Look in its downloads.")
+    expect(page.get_by_role("note")).to_contain_text("in this tablet’s Downloads")
 
 
 def test_control_is_taken_from_another_screen(open_page: Open, real: Real, complaints: Complaints) -> None:
