@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from device import atomic_io
-from services.errors import RecordNotFound
 from services.identity.audit_key import find_audit_key
 from services.running_time import announced, announcing, say
 
@@ -64,11 +63,12 @@ def copy(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the copies, a folder for each capture.")],
 ) -> None:
     """Copy captures without encryption: raw frames, pictures and report; they are pictures of a person."""
-    from services.records.capture_store import CaptureStore  # deferred: imports SQLAlchemy
+    from services.records import schema  # deferred: imports SQLAlchemy
+    from services.records.capture_store import CaptureStore
+    from services.records.earlier_stores import require_store
     from services.records.storage_errors import storage_errors
 
-    if not (data / "captures").is_dir():
-        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    require_store(data / schema.DATABASE)
     with CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
         atomic_io.make_folder(output)
         for id in capture:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
+from pydantic import TypeAdapter
+
 from device import atomic_io
 from device.clock import Clock
 from services.records import digested_json
@@ -17,6 +19,7 @@ FILE = "lock-out.json"
 MAX_WAIT_S, MAX_OWN_SCREEN_WAIT_S = 300.0, 60.0
 FORGOTTEN_S = 86_400.0
 MAX_ENTRIES = 500  # the oldest go first
+_ROWS = TypeAdapter(list[tuple[str, str, int]])  # account, address, wrong attempts
 
 
 @dataclass
@@ -73,22 +76,14 @@ class LockOut:
 
     def _read(self) -> tuple[dict[tuple[str, str], _Failures], bool]:
         try:
-            rows = digested_json.decoded(self._file.read_bytes())["failures"]
-            now_s = self._clock.now_s()
-            if not isinstance(rows, list):
-                raise ValueError("no list")
-            found = {}
-            for row in rows:
-                if not isinstance(row, list):
-                    raise ValueError("no row")
-                account, address, count = row
-                found[str(account), str(address)] = _Failures(int(str(count)), now_s)
+            rows = _ROWS.validate_python(digested_json.decoded(self._file.read_bytes())["failures"])
         except FileNotFoundError:
             return {}, False
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError) as error:
             log.warning("the wrong attempts to sign in cannot be read: %s", error)
             return {}, True
-        return found, False
+        now_s = self._clock.now_s()
+        return {(account, address): _Failures(count, now_s) for account, address, count in rows}, False
 
     def _write(self) -> None:
         rows: list[JsonValue] = [[*key, failures.count] for key, failures in self._failures.items()]
