@@ -530,6 +530,30 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
     assert ask(app, "GET", "/api/audit", token).json()["problem"] is not None
 
 
+def test_a_second_user_of_one_tablet_ends_the_login_of_the_first(fresh: Rig) -> None:
+    """The cookie is replaced, and a copy of the first one is of no use."""
+    for name, roles in (("Asha", ROLES), ("Ravi", ROLES[:1])):
+        fresh.authenticator.users.add(name, PIN, roles)
+    token, used = None, []
+    for name in ("Asha", "Ravi"):
+        answer = ask(fresh.app, "POST", "/api/login", token, json={"name": name, "secret": PIN})
+        used.append(token := answer.cookies["login"])
+    assert [ask(fresh.app, "GET", "/api/visits", one).status_code for one in used] == [401, 200]
+    assert ask(fresh.app, "GET", "/api/users", token).status_code == 403, "the rights of the second user"
+
+
+def test_with_a_damaged_audit_log_the_exam_goes_on_and_the_damage_is_shown(fresh: Rig, tmp_path: Path) -> None:
+    (tmp_path / "audit-log.jsonl").write_bytes(b"no entry\n")
+    (tmp_path / "audit-head.json").write_bytes(b"no head")
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=AuditLog(tmp_path, b"k" * 32, fresh.clock)).http
+    assert ask(app, "POST", "/api/visits", client=HERE, json={"key": "0" * 16}).status_code == 201
+    assert ask(app, "POST", "/api/captures", client=HERE, json={"eye": "OD"}).status_code == 201
+    fresh.authenticator.users.add("Asha", PIN, ROLES)
+    shown = ask(app, "GET", "/api/audit", fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)).json()
+    assert shown["problem"] is not None
+    assert {entry["action"] for entry in shown["entries"]} >= {"begin-visit", "capture"}, "later entries are kept"
+
+
 def test_without_room_for_the_audit_log_the_exam_goes_on(fresh: Rig, tmp_path: Path) -> None:
     log = AuditLog(tmp_path / "missing", b"k" * 32, fresh.clock)
     app = create_app(fresh.arbiter, fresh.authenticator, audit_log=log).http
