@@ -3,7 +3,8 @@
 `write_atomically` replaces one file; the steps of a longer write are separate functions, and `replace_durably` is the
 last one. Each step is on the disk before the next begins, so a power cut leaves the old or the new state.
 Files and folders are private (PRIVATE_FILE, PRIVATE_FOLDER) unless the caller gives another mode; None is that of the
-umask, for what a command writes to a path that its user names.
+umask, for what a command writes to a path that its user names. Those of root get the owner of the folder that they are
+in: a command as root must leave no file in a data folder that the server, another user, cannot read.
 """
 
 import errno
@@ -77,6 +78,13 @@ def _make_one(folder: Path, mode: int | None, exist_ok: bool = False) -> None:
     folder.mkdir(0o777 if mode is None else mode, exist_ok=exist_ok)
     if mode is not None:
         folder.chmod(mode)
+    _give_to_owner(folder, folder.parent)
+
+
+def _give_to_owner(new: Path | int, folder: Path) -> None:
+    """Give a new folder or file (path or descriptor) of root to the owner of `folder`."""
+    if os.geteuid() == 0 and (owner := folder.stat().st_uid) != 0:
+        os.chown(new, owner, -1)
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes], private: bool = True) -> None:
@@ -92,7 +100,9 @@ def write_folder(folder: Path, files: Mapping[str, bytes], private: bool = True)
 
 def private_opener(path: str | os.PathLike[str], flags: int) -> int:
     """Return a descriptor of a file, private if it is new; the argument `opener` of `open`."""
-    return os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+    descriptor = os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+    _give_to_owner(descriptor, Path(path).parent)
+    return descriptor
 
 
 def write_file(path: Path, content: bytes, mode: int | None = PRIVATE_FILE) -> None:
@@ -102,6 +112,7 @@ def write_file(path: Path, content: bytes, mode: int | None = PRIVATE_FILE) -> N
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else mode)
     with open(descriptor, "wb") as file:
+        _give_to_owner(descriptor, path.parent)
         if mode is not None:
             os.fchmod(descriptor, mode)
         file.write(content)

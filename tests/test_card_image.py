@@ -15,7 +15,7 @@ import yaml
 
 from device.config.head_file import load_head
 from services.identity.apply_settings import OUTPUT
-from services.identity.certificates import ACCESS_POINT_ADDRESS, SHARED_HOST_NAME
+from services.identity.certificates import ACCESS_POINT_ADDRESS, SHARED_HOST_NAMES
 from tests.project_files import ROOT, text
 
 CARD = "systemd/image/card"
@@ -197,7 +197,7 @@ def test_country_of_the_settings_is_set_when_the_radio_appears() -> None:
 def test_avahi_host_name_is_in_the_certificate() -> None:
     conf = configparser.ConfigParser()
     conf.read_string(text("systemd/image/avahi-daemon.conf"))
-    assert f"{conf['server']['host-name']}.local" == SHARED_HOST_NAME
+    assert f"{conf['server']['host-name']}.local" == SHARED_HOST_NAMES[0]
 
 
 def test_journal_size_is_limited() -> None:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from device import atomic_io
-from services.identity.audit_key import find_audit_key
+from device.clock import SystemClock
+from services.identity.audit_key import find_audit_key, load_or_create_audit_key
+from services.records.audit_log import AuditLog
 from services.running_time import announced, announcing, say
 
 if TYPE_CHECKING:
@@ -69,9 +71,11 @@ def copy(
     from services.records.storage_errors import storage_errors
 
     require_store(data / schema.DATABASE)
-    with CaptureStore(data, key=find_audit_key(data)) as store, storage_errors():
+    key = load_or_create_audit_key(data)
+    with CaptureStore(data, key=key) as store, storage_errors():
         atomic_io.make_folder(output)
         for id in capture:
+            AuditLog(data, key, SystemClock()).append("", "copy", id, field="plain", by="command")
             atomic_io.write_folder(output / id, {name: store.read(id, name) for name in store.get(id).files})
     typer.echo(f"{output}: {len(capture)} captures")
 

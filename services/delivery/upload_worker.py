@@ -169,6 +169,6 @@ def archive_builder(store: CaptureStore, people: VisitRepository) -> Callable[[s
         if visit.finished_at is None:
             raise Busy("the visit was opened again")
         name = folder_name(visit)
-        return VisitArchive(name, zip_archive(name, uploaded_files(store, visit), visit.begun_at))
+        return VisitArchive(name, zip_archive(name, uploaded_files(store, people, visit), visit.begun_at))
 
     return build

@@ -1,6 +1,7 @@
 """Export of a visit: its files as a mapping for a ZIP archive or a USB drive.
 
-De-identified: the fields name, phone and village are left out; patient number and visit id identify the visit.
+De-identified: the fields name, phone and village are left out, also of the history; patient number and visit id
+identify the visit, and the history names the users who changed it.
 """
 
 import hashlib
@@ -18,29 +19,32 @@ from services.records.capture_store import CaptureStore
 from services.records.device_identity import read_device
 from services.records.json_values import JsonObject
 from services.records.visit import Visit
-from services.records.visit_document import visit_document
+from services.records.visit_document import ChangeList, visit_document
+from services.records.visit_repository import VisitRepository
 
 ENCRYPTED_NAME = "visit.zip.age"
 EARLIEST_ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # earliest date of a ZIP entry
 
 
-def export_files(store: CaptureStore, visit: Visit, undo_until: datetime | None) -> dict[str, bytes]:
-    """Return the exported files of a visit by name, with the time until which its finish can be undone, or None.
+def export_files(store: CaptureStore, repository: VisitRepository, visit: Visit) -> dict[str, bytes]:
+    """Return the exported files of a visit by name.
 
     `<slot>-<number>.png` (in green light) and `.json`: picture and report of each capture, the oldest of a slot first;
     `<slot>-<number>-colour.png`: its picture in colour, if there is one; `visit.json`: the visit without identifying
-    fields, with the origin of its newest picture in `device`; `SHA256SUMS`. StoreDamaged if any picture or report is
+    fields, with the origin of its newest picture in `device`; `history.json`: its changes (`ChangeList`), those of
+    identifying fields left out; `SHA256SUMS`. StoreDamaged if any picture or report is
     damaged.
     """
-    return _files(store, visit, visit_document(visit, undo_until).model_dump(mode="json"))
+    shown = visit_document(visit, repository.undo_until(visit)).model_dump(mode="json")
+    return _files(store, repository, visit, shown)
 
 
-def uploaded_files(store: CaptureStore, visit: Visit) -> dict[str, bytes]:
+def uploaded_files(store: CaptureStore, repository: VisitRepository, visit: Visit) -> dict[str, bytes]:
     """Return the uploaded files of a visit: those of the export, without the time of undo, which changes by the day."""
-    return _files(store, visit, visit_document(visit).model_dump(mode="json", exclude={"undo_until"}))
+    return _files(store, repository, visit, visit_document(visit).model_dump(mode="json", exclude={"undo_until"}))
 
 
-def _files(store: CaptureStore, visit: Visit, shown: JsonObject) -> dict[str, bytes]:
+def _files(store: CaptureStore, repository: VisitRepository, visit: Visit, shown: JsonObject) -> dict[str, bytes]:
     files: dict[str, bytes] = {}
     device = _origin(store, visit)
     for slot, state in visit.slots.items():
@@ -53,6 +57,8 @@ def _files(store: CaptureStore, visit: Visit, shown: JsonObject) -> dict[str, by
     if device is not None:
         plain["device"] = device.as_json()
     files["visit.json"] = json.dumps(plain, indent=1, ensure_ascii=False).encode()
+    history = ChangeList(changes=[one for one in repository.changes(visit.id) if one.field not in IDENTIFIERS])
+    files["history.json"] = history.model_dump_json(indent=1).encode()
     sums = [f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items()]
     return files | {"SHA256SUMS": "".join(sums).encode()}
 

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from device.errors import DiffuscopeError, InputError
 from services.errors import CrossOriginRequest, UntrustedHost
-from services.identity.certificates import SHARED_HOST_NAME
+from services.identity.certificates import SHARED_HOST_NAMES
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 LIGHT_EMITTING_PATHS = frozenset({"/api/preview"})
@@ -101,7 +101,7 @@ def _unmapped(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> ipaddre
 def own_host_names() -> tuple[str, ...]:
     """Return the names of this computer: its host name, and those that avahi publishes."""
     name = socket.gethostname()
-    return name, f"{name}.local", SHARED_HOST_NAME
+    return name, f"{name}.local", *SHARED_HOST_NAMES
 
 
 def _authority(origin: str) -> str:

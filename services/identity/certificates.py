@@ -18,9 +18,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from device.clock import Clock
 
 Address = IPv4Address | IPv6Address
-SHARED_HOST_NAME = "diffuscope.local"  # published by avahi on every device
+# avahi publishes the first one on every device, and the next free one if another device in the network has it.
+SHARED_HOST_NAMES = ("diffuscope.local", *(f"diffuscope-{number}.local" for number in range(2, 10)))
 ACCESS_POINT_ADDRESS = IPv4Address("10.42.0.1")  # of the access point: NetworkManager's default
-PRIVATE = "10.0.0.0/8 172.16.0.0/12 192.168.0.0/16 169.254.0.0/16 127.0.0.0/8 fc00::/7 fe80::/10 ::1/128"
+PRIVATE = "10.0.0.0/8 172.16.0.0/12 192.168.0.0/16 169.254.0.0/16 127.0.0.0/8 fc00::/7 ::1/128"
 NETWORKS = tuple(ip_network(network) for network in PRIVATE.split())
 # The clock at the first boot may be years wrong: the authority's validity does not depend on it.
 AUTHORITY_BEGIN = datetime(2020, 1, 1, tzinfo=UTC)
@@ -33,7 +34,8 @@ CLOCK_TOLERANCE = timedelta(days=30)  # of a tablet whose clock is behind
 def present_addresses(root: Path = Path("/")) -> tuple[Address, ...]:
     """Return the private addresses of this computer, from the kernel's tables below `root`, those of loopback included.
 
-    Public ones are left out: one name outside of the constraints makes the whole certificate invalid.
+    Public ones are left out: one name outside of the constraints makes the whole certificate invalid. So are link-local
+    ones of IPv6, which no browser opens: they are valid with the name of a network interface only.
     """
     tables = root / "proc/net/fib_trie", root / "proc/net/if_inet6"
     ipv4, ipv6 = (table.read_text() if table.exists() else "" for table in tables)
@@ -49,7 +51,7 @@ def create_authority(name: str, clock: Clock) -> tuple[bytes, bytes, bytes]:
     The first certificate is limited to device `name` and private networks, the second one is not.
     """
     key = ec.generate_private_key(ec.SECP256R1())
-    permitted = [x509.DNSName(SHARED_HOST_NAME), x509.DNSName(f"{name}.local"), *map(x509.IPAddress, NETWORKS)]
+    permitted = [*_host_names(name), *map(x509.IPAddress, NETWORKS)]
     subject = _distinguished_name(f"{name} made {clock.wall():%Y-%m-%d}")
     constrained = _signed_authority(key, subject, x509.NameConstraints(permitted, None))
     return _pem(key), constrained, _signed_authority(key, subject)
@@ -76,7 +78,7 @@ def create_server_certificate(
     issuer = x509.load_pem_x509_certificate(authority_crt)
     key = ec.generate_private_key(ec.SECP256R1())
     named = dict.fromkeys([ACCESS_POINT_ADDRESS, *addresses])  # the access point may start later
-    names = [x509.DNSName(SHARED_HOST_NAME), x509.DNSName(f"{name}.local"), *map(x509.IPAddress, named)]
+    names = [*_host_names(name), *map(x509.IPAddress, named)]
     start = max(_now(clock) - CLOCK_TOLERANCE, BUILD_DATE)
     certificate = (
         _builder(_distinguished_name(name), issuer.subject, key.public_key())
@@ -114,6 +116,10 @@ def host_names(pem: bytes) -> list[str]:
 def fingerprint(pem: bytes) -> str:
     """Return the SHA-256 fingerprint of a certificate as tablets show it: 32 pairs of hexadecimal digits."""
     return x509.load_pem_x509_certificate(pem).fingerprint(hashes.SHA256()).hex(" ").upper()
+
+
+def _host_names(name: str) -> list[x509.DNSName]:
+    return [x509.DNSName(host) for host in (*SHARED_HOST_NAMES, f"{name}.local")]
 
 
 def _now(clock: Clock) -> datetime:

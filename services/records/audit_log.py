@@ -60,7 +60,8 @@ class AuditFinding:
 
 
 class AuditLog:
-    """Audit log in the folder of a store; `key`: secret key of its digests, at least 32 bytes. Thread-safe.
+    """Audit log in the folder of a store; `key`: secret key of its digests, at least 32 bytes. Thread-safe, also with
+    other processes.
 
     Entries continue after the number of the head, so that a gap stays visible after the log was cut or changed.
     """
@@ -68,13 +69,13 @@ class AuditLog:
     def __init__(self, folder: Path, key: bytes, clock: Clock) -> None:
         self._folder, self._key, self._clock = folder, key, clock
         self._lock = Lock()
-        self._last: tuple[int, str] | None = None
+        self._last, self._bytes = (0, ""), -1  # last entry of this process, and size of the file with it
         self._archived = (0, "")
 
     def append(self, user: str, action: str, record: str = "", **more: str) -> None:
         """Append one entry durably; OSError if the disk refuses."""
-        with self._lock:
-            number, before = self._last or self._position()
+        with self._lock, atomic_io.file_lock(self._folder / LOG):
+            number, before = self._last if self._bytes == audit_log_bytes(self._folder) else self._position()
             texts: dict[str, JsonValue] = {name: text[:MAX_TEXT] for name, text in more.items() if text}
             entry: dict[str, JsonValue] = {
                 "number": number + 1,
@@ -89,7 +90,7 @@ class AuditLog:
             with open(path, "ab", buffering=0, opener=atomic_io.private_opener) as file:
                 file.write(_line(entry | {"mac": mac}))
             atomic_io.fsync_file(path)
-            self._last = number + 1, mac
+            self._last, self._bytes = (number + 1, mac), audit_log_bytes(self._folder)
             atomic_io.write_atomically(self._folder / HEAD, _head(self._key, self._last, self._archived))
 
     def archive(self, target: Path) -> int:
@@ -106,7 +107,7 @@ class AuditLog:
                 shutil.copyfileobj(file, copy)
             atomic_io.fsync_file(target)
             atomic_io.write_atomically(self._folder / HEAD, _head(self._key, last, last))
-            self._last = self._position()
+            self._position()  # removes the entries that are archived
         return last[0]
 
     def entries(self, limit: int, user: str = "", action: str = "", record: str = "") -> list[AuditEntry]:

@@ -39,14 +39,14 @@ class PatientKeys:
     """Keys of the patients of the store in `folder`, wrapped by its `key`; OSError if the disk refuses. Thread-safe.
 
     Opening heals what is damaged in one copy. Other processes may use the same files. With `readonly` nothing is
-    written. `erased`: ids of the patients whose key this process found or made erased.
+    written.
     """
 
     def __init__(self, folder: Path, key: bytes | None, readonly: bool = False) -> None:
         self._paths = [folder / name for name in FILES]
         self._wrapping = _wrapping(key)
         self._places = dict[str, int]()  # of the slots, by patient id; replaced as a whole
-        self.erased = frozenset[str]()
+        self._erased, self._read_at = frozenset[str](), list[int]()
         if readonly:
             self._read_places()
             return
@@ -56,6 +56,13 @@ class PatientKeys:
         with atomic_io.file_lock(self._paths[0]):
             self._heal(wrap_again=key is not None and new_key(folder, key) is not None)
         self.create(DEVICE)
+
+    @property
+    def erased(self) -> frozenset[str]:
+        """Ids of the patients whose key is erased; the files are read again if any process has changed one."""
+        if self._changed_at() != self._read_at:
+            self._read_places()
+        return self._erased
 
     def create(self, patient_id: str) -> None:
         """Make the key of a patient (id of at most 36 bytes), durable in both files; no effect if there was one."""
@@ -97,10 +104,14 @@ class PatientKeys:
             places = self._read_places()  # another process may have made the key
         raise StoreDamaged(f"the key of the patient {patient_id!r:.60} is missing or damaged")
 
+    def _changed_at(self) -> list[int]:
+        return [path.stat().st_mtime_ns for path in self._paths if path.exists()]
+
     def _read_places(self) -> dict[str, int]:
+        self._read_at = self._changed_at()
         slots = _merged(*map(_slots_in, self._paths))
         self._places = {slot[0]: place for place, slot in enumerate(slots) if slot is not None}
-        self.erased = frozenset(slot[0] for slot in slots if slot is not None and slot[1] == _ERASED)
+        self._erased = frozenset(slot[0] for slot in slots if slot is not None and slot[1] == _ERASED)
         return self._places
 
     def _heal(self, wrap_again: bool) -> None:

@@ -5,7 +5,6 @@ import json
 import secrets
 from collections.abc import Collection
 from contextlib import suppress
-from functools import cache
 
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
@@ -29,7 +28,7 @@ class PatientIndex:
 
     def __init__(self, keys: PatientKeys) -> None:
         self.keys = keys
-        self._number = cache(self._read_number)  # by patient id and encrypted identity
+        self._numbers = dict[tuple[str, str], str | None]()  # by patient id and encrypted identity; replaced as a whole
 
     def encrypted(self, patient_id: str, value: object) -> str:
         """Return a value of JSON as encrypted text (base64); RecordErased or StoreDamaged without the patient's key."""
@@ -49,9 +48,16 @@ class PatientIndex:
             return row_validation.text(values[NUMBER]), fields
 
     def numbers(self, session: Session) -> dict[str, str]:
-        """Return the readable numbers by patient id; only new identities are decrypted, of any process."""
+        """Return the readable numbers by patient id; only new identities are decrypted, of any process.
+
+        Those of patients whom any process erased are forgotten.
+        """
         rows = session.execute(select(PatientRow.patient_id, PatientRow.identity)).all()
-        return {id: number for id, identity in rows if (number := self._number(id, identity)) is not None}
+        known, erased = self._numbers, self.keys.erased
+        entries = [(id, identity) for id, identity in rows if id not in erased]
+        numbers = {entry: known[entry] if entry in known else self._read_number(*entry) for entry in entries}
+        self._numbers = numbers
+        return {id: number for (id, _), number in numbers.items() if number is not None}
 
     def _read_number(self, patient_id: str, identity: str) -> str | None:
         with suppress(StoreError):

@@ -46,7 +46,7 @@ class ReserveFile:
         return self._path.exists() and self._path.stat().st_size == LENGTH_BYTES
 
     def _allocate(self) -> None:
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = atomic_io.private_opener(self._path, os.O_WRONLY | os.O_CREAT)
         try:
             os.posix_fallocate(descriptor, 0, LENGTH_BYTES)  # a file of zeros might need no space
         finally:

@@ -67,6 +67,14 @@ class VisitChange(BaseModel):
     why: ReopenReason | None
 
 
+class ChangeList(BaseModel):
+    """History of a visit, the first change first."""
+
+    model_config = ConfigDict(frozen=True)
+
+    changes: list[VisitChange]
+
+
 def visit_document(visit: Visit, undo_until: datetime | None = None) -> VisitDocument:
     """Return the document of a visit, with identifying fields; ValueError for an answer of an impossible type."""
     return VisitDocument(

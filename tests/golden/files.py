@@ -210,7 +210,7 @@ def _read_visits(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
     exports = {}
     for visit in people.visits(50):
         name = folder_name(visit)
-        content = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
+        content = zip_archive(name, export_files(store, people, visit), visit.begun_at)
         exports[visit.number] = hashlib.sha256(content).hexdigest()
     return {"visits": visits, "counts": people.counts(), "damaged": people.damaged(), "exports": exports}
 
@@ -300,7 +300,7 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
         people = VisitRepository(store.engine, load_programme(), clock)
         (visit,) = (candidate for candidate in people.visits(50) if candidate.number == "B-7")
         name = folder_name(visit)
-        zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
+        zip_bytes = zip_archive(name, export_files(store, people, visit), visit.begun_at)
         lost = CaptureJournal(store).interrupted[0]
         note = store.folder / "journal" / f"{lost.id}.json"
         before = note.read_bytes()

@@ -15,7 +15,7 @@ import pytest
 from device.clock import SystemClock
 from services.http.client_limits import ClientLimits
 from services.http.connection_limits import ConnectionLimits
-from services.identity.certificates import SHARED_HOST_NAME, create_authority, create_server_certificate
+from services.identity.certificates import SHARED_HOST_NAMES, create_authority, create_server_certificate
 from tests.journey.serving import connected, is_closed, served
 
 GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -178,7 +178,7 @@ def test_a_tls_port_and_a_plain_port_share_one_limit(tls: dict[str, Path], tmp_p
 
         def wrapped() -> ssl.SSLSocket:
             client = undo.enter_context(closing(connected(secure)))
-            return undo.enter_context(closing(trusted.wrap_socket(client, server_hostname=SHARED_HOST_NAME)))
+            return undo.enter_context(closing(trusted.wrap_socket(client, server_hostname=SHARED_HOST_NAMES[0])))
 
         idle = [wrapped() for _ in range(3)]
         assert get(plain) == b"0"

@@ -81,7 +81,11 @@ def is_complete(archive_bytes: bytes) -> bool:
     with zipfile.ZipFile(io.BytesIO(archive_bytes)) as archive:
         files = {name.split("/")[1]: archive.read(name) for name in archive.namelist()}
     sums = dict(line.split("  ")[::-1] for line in files.pop("SHA256SUMS").decode().splitlines())
-    assert {"visit.json", "R-centre-1.png", "R-centre-1-colour.png", "R-centre-1.json"} == files.keys() == sums.keys()
+    assert (
+        {"visit.json", "history.json", "R-centre-1.png", "R-centre-1-colour.png", "R-centre-1.json"}
+        == files.keys()
+        == sums.keys()
+    )
     return all(hashlib.sha256(content).hexdigest() == sums[name] for name, content in files.items())
 
 

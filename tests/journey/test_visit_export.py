@@ -38,6 +38,8 @@ def visit(rig: Any, drives: UsbDrives) -> Any:
     fields = {"consent": "agreed", "name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54}
     for field, value in fields.items():
         rig.request("PATCH", at, json={"key": next(keys), "field": field, "value": value})
+    for field, value in {"age": 55, "village": "Elsewhere"}.items():
+        rig.request("PATCH", at, json={"key": next(keys), "field": field, "value": value})
     for _ in range(2):
         press = {"key": next(keys), "eye": "OD", "visit": begun["id"], "slot": "R-centre"}
         assert rig.request("POST", "/api/captures", json=press).status_code == 201
@@ -63,14 +65,18 @@ def test_the_zip_holds_pictures_reports_and_valid_checksums_and_no_identifying_f
     names = {path.name for path in folder.iterdir()}
     pictures = {f"R-centre-{number}.{kind}" for number in (1, 2) for kind in ("png", "json")}
     pictures |= {f"R-centre-{number}-colour.png" for number in (1, 2)}
-    assert names == {"visit.json", "SHA256SUMS"} | pictures
+    assert names == {"visit.json", "history.json", "SHA256SUMS"} | pictures
     for number, capture in enumerate(visit["slots"]["R-centre"]["captures"], 1):
         assert (folder / f"R-centre-{number}.png").read_bytes() == rig.store.read(capture, "picture.png")
         assert (folder / f"R-centre-{number}-colour.png").read_bytes() == rig.store.read(capture, "colour.png")
     exported = json.loads((folder / "visit.json").read_text())
-    assert exported["fields"] == {"age": 54, "consent": "agreed"}
+    assert exported["fields"] == {"age": 55, "consent": "agreed"}
+    shown = rig.request("GET", f"/api/visits/{visit['id']}/changes").json()["changes"]
+    history = json.loads((folder / "history.json").read_text())["changes"]
+    assert history == [change for change in shown if change["field"] not in ("name", "village", "phone")]
+    assert ("age", 54, 55) in [(change["field"], change["was"], change["value"]) for change in history]
     assert exported["slots"] == visit["slots"]
-    for secret in (b"Meena", b"Nowhere", b"12345"):
+    for secret in (b"Meena", b"Nowhere", b"Elsewhere", b"12345"):
         assert secret not in answer.content
 
 

@@ -28,6 +28,13 @@ def filled(folder: Path, entries: int = 30) -> AuditLog:
     return log
 
 
+def test_two_processes_continue_one_chain(tmp_path: Path) -> None:
+    running, command = filled(tmp_path), AuditLog(tmp_path, KEY, VirtualClock())
+    for log in (command, running, command, command, running):
+        log.append("Asha", "view", "visit-1")
+    assert running.check() == AuditFinding(35, None)
+
+
 def edit(folder: Path, chance: random.Random) -> None:
     """Change one bit of the log or of the head."""
     path = folder / chance.choice((LOG, LOG, LOG, HEAD))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pyrage
 import pytest
+from typer.testing import CliRunner
 
 from device.clock import VirtualClock
 from device.errors import StoreFull
@@ -28,6 +29,7 @@ from services.backup.backup_key import (
 )
 from services.backup.restore_backup import Restored, restore_backup
 from services.backup.write_backup import write_backup
+from services.cli import app
 from services.errors import (
     BackupDamaged,
     BackupKeyWrong,
@@ -228,6 +230,13 @@ def test_a_passphrase_restores_and_another_does_not(store: Path, stick: Path, tm
 def test_a_key_that_protects_nothing_is_refused(make: Callable[[], BackupKey]) -> None:
     with pytest.raises(BackupKeyWrong):
         make()
+
+
+def test_a_secret_key_that_is_given_as_a_recipient_is_not_repeated(store: Path, stick: Path) -> None:
+    words = ["store", "backup", "--to", str(stick), "--data", str(store), "--recipient", str(IDENTITY)]
+    refused = CliRunner().invoke(app, words).exception
+    assert isinstance(refused, BackupKeyWrong)
+    assert str(IDENTITY) not in f"{refused.message} {refused.remedy}"
 
 
 def test_a_file_without_a_secret_key_is_refused(tmp_path: Path) -> None:

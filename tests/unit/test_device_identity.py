@@ -115,8 +115,9 @@ def test_a_number_of_an_earlier_release_is_found_with_and_without_its_prefix(tmp
 def test_an_export_without_a_picture_names_its_device(tmp_path: Path) -> None:
     device = load_or_create_device(tmp_path, NO_BOARD)
     with CaptureStore(tmp_path) as store:
-        visit = VisitRepository(store.engine, load_programme(), VirtualClock()).begin("0" * 16)
-        for files in (export_files(store, visit, None), uploaded_files(store, visit)):
+        people = VisitRepository(store.engine, load_programme(), VirtualClock())
+        visit = people.begin("0" * 16)
+        for files in (export_files(store, people, visit), uploaded_files(store, people, visit)):
             block = json.loads(files["visit.json"])["device"]
             assert (block["uuid"], block["serial"]) == (device.uuid, device.serial)
 

@@ -28,6 +28,7 @@ from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal
 from services.records.capture_store import CaptureStore
 from services.records.erasure import ErasureReceipt
+from services.records.patient_keys import PatientKeys
 from services.records.recovery_report import RecoveryReport
 from services.records.store_check import check_store
 from tests import erasures
@@ -231,6 +232,16 @@ def test_an_erased_patient_is_erased_for_another_process_too(folder: Path) -> No
             repository(running).get(visit)
         with pytest.raises((RecordErased, RecordNotFound)):
             running.read(capture_id(NUMBER, 1), "picture.png")
+
+
+def test_a_number_is_forgotten_as_soon_as_another_process_has_erased_the_key(folder: Path) -> None:
+    """The rows follow later, or at the next opening after an interruption."""
+    with opened(folder) as running:
+        erased = running.erasures.find(NUMBER).patient_id
+        PatientKeys(folder, read_audit_key(folder)).erase(erased)
+        with pytest.raises(RecordNotFound):
+            running.erasures.find(NUMBER)
+        assert repository(running).visits(10, number=NUMBER) == []
 
 
 def test_the_command_erases_a_patient_and_verifies_the_receipt(folder: Path) -> None:

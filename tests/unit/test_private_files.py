@@ -10,6 +10,7 @@ from typing import Any
 
 import pyrage
 import pytest
+from typer.testing import CliRunner
 
 from device import atomic_io
 from device.calibration.signing import create_key_pair
@@ -19,9 +20,12 @@ from services.backup.backup_key import key_for_recipients
 from services.backup.write_backup import write_backup
 from services.delivery.usb_drives import copy_to_drive
 from services.health.event_log import EventLog
+from services.identity.audit_key import load_or_create_audit_key
 from services.identity.lock_out import LockOut
 from services.identity.provision import load_or_create_identity
 from services.identity.users import UserTable
+from services.identity.users_command import app as users_command
+from services.records.audit_log import AuditLog
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
@@ -30,6 +34,7 @@ from services.records.programme import load_programme
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
 
+OTHER_USER_ID = 54_321
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
 
 
@@ -78,6 +83,25 @@ def test_a_data_folder_is_private_with_any_umask(umask: int, tmp_path: Path) -> 
         assert modes(data) == {}
     [backup] = (tmp_path / "stick").iterdir()
     assert modes(backup) == {}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for another user")
+def test_commands_of_root_leave_every_file_to_the_owner_of_the_data_folder(tmp_path: Path) -> None:
+    data, clock = tmp_path / "data", VirtualClock()
+    data.mkdir(0o700)
+    os.chown(data, OTHER_USER_ID, OTHER_USER_ID)
+    (tmp_path / "secret").write_text("274913")
+    words = ["add", "Asha", "--role", "administrator", "--data", str(data), "--secret-file", str(tmp_path / "secret")]
+    assert CliRunner().invoke(users_command, words).exit_code == 0
+    key = load_or_create_audit_key(data)
+    AuditLog(data, key, clock).append("", "copy", "c", by="command")
+    with CaptureStore(data, reserve_bytes=1, key=key) as store:
+        VisitRepository(store.engine, load_programme(), clock).begin("0123456789abcdef")
+        store.save(Capture("c", "OD", NOON, True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
+        DoseLedgerStore(store.engine, clock, 86_400.0, "boot")
+        assert (data / "store.sqlite-wal").exists()
+        others = [str(path.relative_to(data)) for path in data.rglob("*") if path.stat().st_uid != OTHER_USER_ID]
+    assert others == []
 
 
 def test_an_identity_is_private_with_any_umask(umask: int, tmp_path: Path) -> None:

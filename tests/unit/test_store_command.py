@@ -8,9 +8,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from device.clock import SystemClock
 from device.errors import StoreError
 from services.backup.store_command import app
 from services.errors import RecordNotFound, StoreDamaged
+from services.identity.audit_key import read_audit_key
+from services.records.audit_log import AuditLog
 from services.records.capture_store import CaptureStore
 from tests.store_damage import Shown, expected, filled_store, shown
 
@@ -76,8 +79,11 @@ def test_a_changed_file_of_a_capture_is_damaged(filled: tuple[Path, Shown], tmp_
 
 
 def test_a_copy_of_a_capture_is_readable_without_the_store(filled: tuple[Path, Shown], tmp_path: Path) -> None:
-    words = ["copy", "test", "--data", str(filled[0]), "--output", str(tmp_path / "out")]
+    data = shutil.copytree(filled[0], tmp_path / "store")
+    words = ["copy", "test", "--data", str(data), "--output", str(tmp_path / "out")]
     assert CliRunner().invoke(app, words).exit_code == 0
+    (entry,) = AuditLog(data, read_audit_key(data), SystemClock()).entries(9)
+    assert (entry.action, entry.record, entry.more) == ("copy", "test", {"field": "plain", "by": "command"})
     copied = {("test", path.name): path.read_bytes() for path in (tmp_path / "out" / "test").iterdir()}
     assert copied == {place: content for place, content in filled[1].files.items() if place[0] == "test"}
     assert isinstance(CliRunner().invoke(app, words).exception, StoreError), "a copy was replaced"

@@ -169,7 +169,7 @@ def test_a_capture_after_the_finish_queues_the_visit_again(setup: QueueSetup) ->
     setup.store.save(capture, {"picture.png": b"png", "report.json": b"{}"}, target.write_rows)
     assert setup.queued() == [visit]
     assert worker_of(setup, uploader).step()
-    assert [len(archive_names(parcel)) for parcel in uploader.uploaded] == [2, 4]
+    assert [len(archive_names(parcel)) for parcel in uploader.uploaded] == [3, 5]
 
 
 def archive_names(parcel: VisitArchive) -> list[str]:

@@ -33,7 +33,7 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
         """Return a visit as ZIP archive, encrypted if the programme has public keys; 404 for an unknown visit."""
         request.state.audit_field = audited_as
         visit = repository.get(id)
-        name, files = folder_name(visit), export_files(store, visit, repository.undo_until(visit))
+        name, files = folder_name(visit), export_files(store, repository, visit)
         attachment = f'attachment; filename="{name}.zip'
         if recipients:
             content = encrypted_copy(visit, files, recipients)[ENCRYPTED_NAME]
@@ -68,7 +68,7 @@ def _listed(drive: UsbDrive) -> UsbDriveAnswer:
 
 def _copied(store: CaptureStore, repository: VisitRepository, visit: Visit, drive: Path) -> str:
     """Copy a visit to a drive, and record it if finished; return drive and folder without the number: it is stored."""
-    files = export_files(store, visit, repository.undo_until(visit))
+    files = export_files(store, repository, visit)
     if recipients := repository.programme.exports.recipients:
         files = encrypted_copy(visit, files, recipients)
     folder = copy_to_drive(drive, folder_name(visit), files)

@@ -13,7 +13,6 @@ from services.http.control_lease import ControlLease
 from services.http.schemas.captures import LateralityCorrection
 from services.http.schemas.common import IdempotentRequest
 from services.http.schemas.visits import (
-    ChangeList,
     ControlRequest,
     FieldValue,
     LeaseAnswer,
@@ -28,7 +27,7 @@ from services.instrument.pending_captures import PendingCaptures
 from services.records.programme import Programme
 from services.records.row_validation import reading_record, without_damaged
 from services.records.visit import Visit
-from services.records.visit_document import VisitDocument, visit_document
+from services.records.visit_document import ChangeList, VisitDocument, visit_document
 from services.records.visit_repository import VisitRepository
 
 ISO_DATE = re.compile("[0-9]{4}-[0-9]{2}-[0-9]{2}")

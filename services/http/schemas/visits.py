@@ -9,7 +9,7 @@ from services.http.schemas.problems import ErrorText
 from services.instrument.visit_montage import MontageState
 from services.records.json_values import FormValue
 from services.records.visit import ReopenReason
-from services.records.visit_document import VisitChange, VisitDocument
+from services.records.visit_document import VisitDocument
 
 
 class NewVisit(IdempotentRequest):
@@ -43,12 +43,6 @@ class Reopening(IdempotentRequest):
     """Request body: why a finished visit is opened again."""
 
     reason: ReopenReason
-
-
-class ChangeList(ResponseBody):
-    """History of a visit, the first change first."""
-
-    changes: list[VisitChange]
 
 
 class ControlRequest(IdempotentRequest):
