@@ -38,7 +38,7 @@ async function showRoute(route) {
   if (!same) lowerAlerts(({ from }) => from === "press");
   if (route.visit !== before.visit) lowerAlert("shot.crossed");
   if (route.screen !== "outcome") set({ finishing: null });
-  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, qrCode: null });
+  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, isCodeShown: false });
   buttonsChanged();
   lowerAlert("link.slow");
   if (route.screen !== "pictures" || route.visit !== before.visit) set({ montages: Object.freeze({}), changes: Object.freeze([]) });
@@ -118,7 +118,7 @@ function leaveVisit() {
 
 // Initial keyboard focus of each screen.
 const SHUTTER = "#shutter";
-const FOCUS = { aim: SHUTTER, picture: SHUTTER, home: "#new", outcome: "#done" };
+const FOCUS = { aim: SHUTTER, picture: SHUTTER, home: "#new", outcome: "#outcome-title" };
 const focusScreen = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScroll: true });
 
 // ---- server events

@@ -119,7 +119,8 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
     take_picture(page)
     expect(page.locator("#next")).to_contain_text("Finish")
     tap(page, "#next")
-    expect(page.locator(".outcome .verdict")).to_contain_text("Refer: not every picture of the left eye possible.")
+    expect(page.locator(".outcome .verdict")).to_contain_text("Refer")
+    expect(page.locator(".reasons")).to_have_text(re.compile("Left eye · .*: Small pupil"))
     faults["outcome"] = look_for_faults(page, "#done")
     visit = real.visit()
     assert len(visit["slots"]["L-centre"]["captures"]) == 3, "every try is kept"
@@ -174,7 +175,7 @@ def test_visit_without_consent_can_only_be_finished(open_page: Open, real: Real)
     tap(page, "[data-do=ask]")
     page.locator("[data-value=declined]").tap()
     tap(page, "#finish")
-    expect(page.locator(".outcome .verdict")).to_have_text("The patient did not agree to pictures. None were taken.")
+    expect(page.locator(".outcome")).to_have_attribute("data-outcome", "declined")
     assert real.visit()["outcome"]["code"] == "declined"
     assert real.presses == 0
     tap(page, "#done")
@@ -193,6 +194,9 @@ def test_finish_asks_when_a_picture_is_missing(open_page: Open, real: Real) -> N
     tap(page, "#finish")
     page.locator("#finish-without").tap()
     page.wait_for_selector(".outcome .verdict")
+    expect(page.locator("#outcome-title")).to_be_focused()
+    after_debounce(page).keyboard.press("Enter")
+    expect(page.locator("#outcome-title")).to_be_visible()  # a second press of a wireless shutter leaves nothing
     assert real.visit()["finished_at"] is not None
 
 
@@ -297,24 +301,28 @@ def test_confirmed_eye_is_not_asked_again(open_page: Open, make_real: MakeReal) 
 
 def test_finished_visit_is_reopened_and_qr_code_has_no_name(open_page: Open, make_real: MakeReal) -> None:
     programme = load_programme()
-    phone = programme.referral.model_copy(update={"centre_phone": "+91 44 5550 0142"})
-    real = make_real(programme=programme.model_copy(update={"referral": phone}))
-    visit = real.begin_visit(consent="agreed", name="Lakshmi")
+    where = {"en": "Eye clinic, District Hospital", "ta": "கண் மருத்துவமனை"}
+    referral = programme.referral.model_copy(update={"centre_phone": "+91 44 5550 0142", "where": where})
+    letter = programme.letter.model_copy(update={"name": "Village Eye Programme"})
+    real = make_real(programme=programme.model_copy(update={"referral": referral, "letter": letter}))
+    visit = real.begin_visit(consent="agreed", name="Lakshmi", vision_od="6/60", vision_os="6/9")
     for slot in ("R-centre", "R-nerve", "L-centre"):
         real.press(visit["id"], slot)
     page = open_page(f"{real.url}/#/visit/{visit['id']}/aim/L-nerve")
     wait_for_preview(page)
     finish_early(after_debounce(page))
     page.locator("#code").tap()
-    page.wait_for_selector("figure.code svg path")
+    page.wait_for_selector(".outcome > figure.code svg path")
     decoded = qr_text(page)
     assert decoded.split("\n")[0] == visit["number"]
-    assert decoded.split("\n")[2:] == ["send", "+91 44 5550 0142"]
+    assert decoded.split("\n")[2:] == ["refer_vision", "+91 44 5550 0142"]
     assert "Lakshmi" not in decoded
     page.emulate_media(media="print")
     expect(page.locator(".slip")).to_be_visible()
     expect(page.locator("header")).to_be_hidden()
     expect(page.locator(".slip")).not_to_contain_text("Lakshmi")
+    for words in ("Village Eye Programme", "6/60", "6/9", "not taken", "Go by", "Eye clinic", "Centre: +91"):
+        expect(page.locator(".slip")).to_contain_text(words)
     page.emulate_media(media="screen")
     tap(page, "#reopen")
     tap(page, "[data-reason=mistake]")

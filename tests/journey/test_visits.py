@@ -174,7 +174,8 @@ def test_a_visit_without_possible_pictures_can_be_finished(old_rig: Any) -> None
         assert answer["slots"][slot]["state"] == "not_possible"
         assert answer["slots"][slot]["reason"] == reason
     ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
-    assert ended["outcome"] == {"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}
+    assert (ended["outcome"]["code"], ended["outcome"]["urgency"]) == ("refer_picture", "soon")
+    assert [reason["value"] for reason in ended["outcome"]["reasons"]] == ["pupil", "cloudy", "still", "refused"]
     where = f"/api/visits/{visit['id']}/not-possible"
     refused(
         old_rig.request("POST", where, json={"key": next(keys), "slot": "R-centre", "reason": "pupil"}),

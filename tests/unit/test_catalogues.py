@@ -2,9 +2,13 @@
 
 import json
 import re
+from typing import get_args
 
 import pytest
 
+from services.records.answers import COMPLAINTS
+from services.records.programme import REASONS, VISIONS
+from services.records.visit import OutcomeCode
 from tests.project_files import files, text
 
 DRAFTS = ("hi", "ta", "te")
@@ -85,3 +89,13 @@ def test_the_pages_ask_for_texts_that_the_master_has() -> None:
             asked += len(keys)
             assert keys <= shared | (technician if "technician/" in name else set()), name
     assert asked > 200
+
+
+@pytest.mark.parametrize("language", ["en", *DRAFTS])
+def test_every_outcome_has_its_texts_in_each_catalogue(language: str) -> None:
+    headlines = {f"outcome.{code}" for code in get_args(OutcomeCode)}
+    names = {f"complaint.{name}" for name in COMPLAINTS} | {f"reason.{name}" for name in REASONS}
+    pictures = {"outcome.not_taken", "outcome.no_picture", "outcome.quality", "field.vision_od", "field.vision_os"}
+    visions = {f"vision.{vision}" for vision in VISIONS if "/" not in vision}
+    directions = {"outcome.today", "outcome.soon", "outcome.where", "outcome.phone"}
+    assert headlines | names | pictures | visions | directions <= set(catalogue(language))
