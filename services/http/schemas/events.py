@@ -11,9 +11,10 @@ from pydantic.dataclasses import dataclass
 from device.recon.assessment.aiming import AimCode
 from device.values import Verdict
 from services.http.schemas.captures import CaptureAnswer
-from services.http.schemas.common import OmittedIfNone, ResponseBody
+from services.http.schemas.common import ResponseBody
 from services.http.schemas.problems import ErrorText
 from services.http.schemas.status import AlertAnswer, FindingAnswer
+from services.records.json_values import OmittedIfNone
 from services.records.stored_record import CONFIG
 
 
