@@ -173,6 +173,8 @@ def database(facts: StatusSnapshot) -> Check:
         problems.append(f"{_count(len(facts.recovery.conflicts), 'record has', 'records have')} a second state")
     if facts.recovery.missing:
         problems.append(f"{_count(len(facts.recovery.missing), 'chosen picture is', 'chosen pictures are')} gone")
+    if facts.recovery.lost_visits:
+        problems.append(f"{_count(len(facts.recovery.lost_visits), 'visit is', 'visits are')} gone")
     remedy = DATABASE_REMEDY if problems else ""
     return Check("database", not problems, "; ".join(problems) or "whole", "whole at the last start", remedy)
 

@@ -51,7 +51,7 @@ from services.records.record_signing import (
 )
 from services.records.recovery_report import RecoveryReport
 from services.records.removed_captures import MARK, is_large
-from services.records.schema import CaptureRow, RecordRow
+from services.records.schema import CaptureRow, RecordRow, VisitRow
 from services.records.snapshots import move_to_numbered_folder, refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
 
@@ -118,6 +118,9 @@ class Recovery:
         to_write = [*self._reconcile(session, "patient"), *self._reconcile(session, "visit")]
         suspicious = {*self.report.visits, *(record.id for record in to_write if record.kind == "visit")}
         to_write += self._reconcile(session, "capture", suspicious)
+        if self.report.adopted:
+            named = select(CaptureRow.visit).where(CaptureRow.visit.not_in(select(VisitRow.id))).distinct()
+            self.report.lost_visits += [visit for visit in session.scalars(named) if visit is not None]
         record_rows.restore_slots(session)
         for document, as_described in self._restored_visits:
             missing = record_rows.restore_decisions(session, document.content)
@@ -246,6 +249,7 @@ class Recovery:
             ("patients were restored from their files", report.patients),
             ("records had two states, one of which is now in conflicts/", report.conflicts),
             ("chosen captures have no folder any more", report.missing),
+            ("visits of adopted captures are gone", report.lost_visits),
         ):
             if ids:
                 log.warning("%d %s: %s", len(ids), what, ", ".join(ids[:20]))

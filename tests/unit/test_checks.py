@@ -57,6 +57,7 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
     ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
     ("database", {"recovery": RecoveryReport(missing=["c"])}),
+    ("database", {"recovery": RecoveryReport(lost_visits=["v"])}),
     ("backup", {"unsaved_since": datetime(2026, 11, 14, 11, tzinfo=UTC)}),
     ("audit_log", {"audit_log_bytes": 50_600_000}),
     ("settings", {"settings_problem": ("diffuscope.toml is not TOML", "Correct the file on the card.")}),
