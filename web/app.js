@@ -8,7 +8,6 @@ import { page } from "./screens/page_layout.js";
 import { goOnWhenShown, stay } from "./core/going_on.js";
 import { bindKeys } from "./core/keyboard.js";
 import { checkLogin, reportActivity } from "./core/login.js";
-import "./components/user_login.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
 import { resetPictureTools, captureEventHandlers, openPicture, rejectForeignCapture } from "./core/capture.js";
@@ -79,6 +78,18 @@ async function loadModule(name) {
   } catch (problem) {
     if (!(problem instanceof TypeError)) throw problem;
   }
+}
+
+// The dialog of the login is loaded when it is needed first; without a link, when it is asked for again.
+async function loadLogin({ detail }) {
+  if (customElements.get("user-login")) return;
+  try {
+    await import("./components/user_login.js");
+  } catch (problem) {
+    if (problem instanceof TypeError) return;
+    throw problem;
+  }
+  document.dispatchEvent(new CustomEvent("login-required", { detail }));
 }
 
 async function loadRoute(route) {
@@ -178,6 +189,7 @@ addEventListener("pagehide", releaseControl);
 for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => get().user && reportActivity(), { passive: true });
 
 // A user has signed in: what the page shows stays, and is read again.
+document.addEventListener("login-required", (event) => loadLogin(/** @type {CustomEvent} */ (event)));
 document.addEventListener("login-changed", (event) => {
   set({ user: /** @type {CustomEvent} */ (event).detail });
   refresh();

@@ -461,6 +461,8 @@ def test_a_visit_with_one_picture_without_colour_is_shown_in_green_and_says_why(
     for slot in ("R-centre", "R-nerve"):
         expect(page.locator(f"[data-slot={slot}] img")).to_have_attribute("src", re.compile("/green.jpg$"))
     expect(page.get_by_role("button", name="Colour")).to_have_count(0)
+    expect(page.locator("#grey")).to_be_visible()
+    expect(page.get_by_role("button", name="Red-free")).to_have_count(0)  # it would change nothing
     tap(page, "[data-slot=R-centre]")
     expect(page.locator(".prompt")).to_contain_text(why)
     wait_until_drawn(page, "colour 0 0")
@@ -560,3 +562,42 @@ def test_comparison_is_reloaded_and_refuses_another_visit(open_page: Open, real:
     page.goto(f"{real.url}/#/visit/{visit}/compare/{first}/{second}")
     page.wait_for_selector("[data-screen=patient]")
     expect(page.locator(".state-bar")).to_contain_text("This picture is of another patient.")
+
+
+def test_a_thumbnail_shows_the_whole_field(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real, reduced_motion="reduce")
+    take_picture(page)
+    for at in ((390, 844), (800, 1280), (1280, 800)):
+        page.set_viewport_size({"width": at[0], "height": at[1]})
+        image = page.locator("[data-slot=R-centre] img")
+        expect(image).to_have_js_property("complete", True)
+        # What is visible of the image, relative to the diameter of its field: whole from edge to edge.
+        visible = image.evaluate(
+            """async (image) => {
+            const { field_px: field, shape: [, cols] } = await (await fetch("/api/status")).json();
+            const { width, height } = image.parentElement.getBoundingClientRect();
+            const drawn = image.getBoundingClientRect(); // with its scale
+            const diameter = (Math.max(drawn.width, drawn.height) * field) / cols;
+            return [width / diameter, height / diameter];
+        }"""
+        )
+        assert min(visible) >= 1, at
+
+
+def test_an_enlarged_picture_has_an_overview(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real, reduced_motion="reduce")
+    take_picture(page)
+    wait_until_drawn(page, "colour 0 0")
+    picture = page.locator("#picture")
+    corner = """(pic) => { // colour at the edge of the overview, in the lower right corner
+        const c = pic.querySelector("canvas");
+        const side = 0.22 * Math.min(c.width, c.height), margin = (12 * c.width) / c.clientWidth;
+        const { data } = c.getContext("2d").getImageData(c.width - margin - side, c.height - margin - side / 2, 1, 1);
+        return [...data].slice(0, 3);
+    }"""
+    assert picture.evaluate(corner) != [255, 255, 255]
+    for _ in range(3):
+        tap(page, "[aria-label='Zoom in']")
+    expect(picture).to_have_attribute("data-zoom", "3.38")
+    wait_until_drawn(page, "colour 0 0")
+    assert picture.evaluate(corner) == [255, 255, 255]

@@ -164,7 +164,7 @@ const pictureActions = {
   thumbLoaded({ target }) {
     const { naturalWidth: width, naturalHeight: height } = target;
     const home = homeBox(get().status, width, height);
-    target.style.transform = `scale(${Math.min(width, height) / Math.min(home.width, home.height)})`;
+    target.style.transform = `scale(${Math.max(width, height) / Math.max(home.width, home.height)})`;
   },
 };
 
