@@ -116,7 +116,7 @@ class SecretWrong(AuthenticationError):
 
 
 class PresenceRequired(AuthenticationError):
-    """Set-up of a device with users without a recent press of its button; without a button, from another screen."""
+    """A risk without a recent press of the device's button; without a button, from another screen than its own."""
 
     code = "access.presence"
     default_remedy = "Hold the button of the camera for three seconds. Send this again within half a minute."

@@ -188,8 +188,9 @@ addEventListener("pagehide", releaseControl);
 
 for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => get().user && reportActivity(), { passive: true });
 
-// A user has signed in: what the page shows stays, and is read again.
 document.addEventListener("login-required", (event) => loadLogin(/** @type {CustomEvent} */ (event)));
+
+// A user has signed in: what the page shows stays, and is read again.
 document.addEventListener("login-changed", (event) => {
   set({ user: /** @type {CustomEvent} */ (event).detail });
   refresh();

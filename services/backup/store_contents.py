@@ -16,14 +16,15 @@ from pathlib import Path
 from device import atomic_io
 from device.user_files import files_in
 from services.errors import BackupDamaged, StoreDamaged
+from services.identity import ssh_keys
 from services.records import device_identity, patient_keys, reserve_file, schema, snapshots
 from services.records.record_files import CAPTURE_RECORD
 
 # Logs of the database (their rows are in its copy), older copies of it, the present reserve, and measurements of the
-# computer, which another one has to make again; the identity of the device, since a restored device is another one. The
-# keys of the patients are in a file of their own, which each backup replaces.
+# computer, which another one has to make again; the identity of the device and the decisions on keys for SSH, since a
+# restored device is another one. The keys of the patients are in a file of their own, which each backup replaces.
 _DATABASE_LOGS = (f"{schema.DATABASE}-{suffix}" for suffix in snapshots.LOG_SUFFIXES)
-_OTHERS = {"snapshots", "replaced", "plans", "accuracy", reserve_file.NAME, device_identity.FILE}
+_OTHERS = {"snapshots", "replaced", "plans", "accuracy", reserve_file.NAME, device_identity.FILE, ssh_keys.FILE}
 NOT_BACKED_UP = frozenset({*_DATABASE_LOGS, *patient_keys.FILES, *_OTHERS})
 
 

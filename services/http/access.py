@@ -65,6 +65,8 @@ OPERATIONS: dict[str, tuple[Access, str | None]] = {
     "POST /api/users": (USERS, "add-user"),
     "PATCH /api/users/{name}": (USERS, "change-user"),
     "DELETE /api/users/{name}": (USERS, "remove-user"),
+    "GET /api/ssh-keys": (ADMINISTRATION, None),
+    "POST /api/ssh-keys": (USERS, "decide-ssh-key"),
     "GET /api/openapi.json": (ANY_USER, None),
     "GET /api/audit": (ADMINISTRATION, "read-audit"),
     "GET /api/status": (MONITORED, None),

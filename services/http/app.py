@@ -33,6 +33,7 @@ from services.http.routes.login import login_router
 from services.http.routes.montages import montage_router
 from services.http.routes.preview import preview_router
 from services.http.routes.removal import removal_routes
+from services.http.routes.ssh_keys import ssh_keys_router
 from services.http.routes.status import status_router
 from services.http.routes.updates import UPLOAD_PATH
 from services.http.routes.uploads import upload_router
@@ -88,7 +89,7 @@ def create_app(
     technician's page. `uploader` uploads finished visits; None means that no receiver is set up.
     `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
     `audit_log`: None keeps none. `rates`: limits of operations in time. `system`: root of the file system, from which
-    the source of the clock is read.
+    the source of the clock and the keys of the card are read.
     """
     store = arbiter.context.store
     clock = arbiter.context.clock
@@ -119,6 +120,7 @@ def create_app(
     app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
     app.include_router(login_router(authenticator, lambda: arbiter.pressed_s))
     app.include_router(users_router(authenticator.users))
+    app.include_router(ssh_keys_router(store, system, lambda: arbiter.pressed_s))
     app.include_router(audit_router(audit_log))
     app.include_router(clock_router(clock, system))
     app.include_router(calibration_router(arbiter, lit))

@@ -102,7 +102,7 @@ class Authenticator:
         """
         with self._verifying:
             if self.users.has_begun:  # before the code: who is elsewhere can neither try one nor end it
-                _check_presence(peer, pressed_s)
+                check_presence(peer, pressed_s)
             self._refuse_early(SETUP_ACCOUNT, peer)
             if not self._setup_code.is_valid(code):
                 self._lock_out.record_failure(SETUP_ACCOUNT, peer.address)
@@ -144,8 +144,12 @@ class Authenticator:
         return UNKNOWN_ACCOUNT if user is None else f"{user.name} {user.generation}"
 
 
-def _check_presence(peer: Peer, pressed_s: float | None) -> None:
+def check_presence(peer: Peer, pressed_s: float | None) -> None:
+    """Raise PresenceRequired unless the user is at the device.
+
+    `pressed_s`: time since the button of the head was pressed, None if none can be read: then the own screen counts.
+    """
     if pressed_s is None and not peer.is_own_screen:
-        raise PresenceRequired("this device has users already", OWN_SCREEN_REMEDY)
+        raise PresenceRequired("this needs a user at the device", OWN_SCREEN_REMEDY)
     if pressed_s is not None and pressed_s > PRESSED_S:
         raise PresenceRequired("the button of the camera was not pressed")

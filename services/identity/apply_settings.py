@@ -11,6 +11,7 @@ from pathlib import Path
 
 from device import atomic_io
 from device.errors import DiffuscopeError, SpecError
+from services.identity import ssh_keys
 from services.identity.card_settings import (
     FILE,
     UPDATES,
@@ -24,7 +25,7 @@ from services.identity.card_settings import (
 )
 
 CONNECTIONS = "run/NetworkManager/system-connections"
-OUTPUT = "run/diffuscope-settings"  # readable for all: head file, programme, arguments, country, problem
+OUTPUT = "run/diffuscope-settings"  # readable for all: head file, programme, arguments, country, SSH keys, problem
 HOST_KEY = "ssh_host_ed25519_key"
 
 
@@ -100,13 +101,16 @@ class CardBoot:
             shutil.copyfile(updates, self.root / "etc/diffuscope" / UPDATES)
 
     def _apply_ssh(self, settings: CardSettings) -> None:
-        """Write the public keys, and create the host key once; ssh.service runs only if the file of keys exists."""
-        if settings.ssh is None:
+        """Write the confirmed keys, and create the host key once; ssh.service runs only if the file of keys exists."""
+        asked = () if settings.ssh is None else settings.ssh.keys
+        self._write_public(ssh_keys.FILE, json.dumps(asked).encode())
+        keys = ssh_keys.confirmed_keys(asked, self.root / "data/captures")
+        if not keys:
             return
         if not (self.kept / HOST_KEY).exists():
             words = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(self.kept / HOST_KEY)]
             subprocess.run(words, check=True)
-        self._write_private("run/diffuscope-ssh/authorized_keys", "".join(f"{key}\n" for key in settings.ssh.keys))
+        self._write_private("run/diffuscope-ssh/authorized_keys", "".join(f"{key}\n" for key in keys))
 
     def _publish(self, problem: DiffuscopeError | None) -> None:
         """Write the problem for the page and onto the console, or remove an earlier one."""

@@ -18,6 +18,7 @@ from device.config.head_file import load_head
 from device.config.toml_file import Table, load_toml
 from device.errors import DiffuscopeError, SpecError
 from device.user_files import files_in, read_text
+from services.identity.ssh_keys import fingerprint
 from services.records.programme import load_programme
 
 FILE = "diffuscope.toml"
@@ -50,7 +51,7 @@ class Ethernet(Table):
 
 
 class Ssh(Table):
-    """Public keys that may log in as root; without one the SSH server stays off."""
+    """Public keys that log in as root once an administrator has confirmed them; without one the SSH server is off."""
 
     keys: tuple[str, ...] = Field(min_length=1)
 
@@ -59,6 +60,7 @@ class Ssh(Table):
         for key in self.keys:
             if not re.fullmatch(r"(ssh-ed25519|ssh-rsa|ecdsa-sha2-\S+|sk-\S+) [A-Za-z0-9+/=]{40,}( [^\n]*)?", key):
                 raise ValueError("a key is the one line of a file such as id_ed25519.pub")
+            fingerprint(key)
         return self
 
 

@@ -15,6 +15,7 @@ from threading import Thread
 
 import pytest
 
+from services.identity.ssh_keys import fingerprint
 from tests.boot.machine import CARD_MB, Board, Card, run, wait_until
 from tests.debian_kernel import CONFIG
 from tests.project_files import ROOT
@@ -27,6 +28,7 @@ HERE = ROOT / "tests/boot"
 PYTHON = "/opt/diffuscope/.venv/bin/python"
 DIFFUSCOPE = "diffuscope"  # as remedies write it
 BROKEN = '"""A release that ends as soon as it is asked to serve."""\n\nraise SystemExit("broken release")\n'
+CONFIRMED = "[Service]\nExecStartPre=/usr/bin/cp /etc/diffuscope/ssh-keys.json /data/captures/\n"
 IMPATIENT = 'sticks = "/media"\npatience_s = 25.0\n'
 PASSWORD = "eight or more"
 SETTINGS = f"""\
@@ -62,8 +64,9 @@ def say(line: str) -> None:
 
 @dataclass(frozen=True)
 class Builds:
-    """Card of version 1.0.0 and USB drives with the updates 1.1.0 and, broken, 1.2.0."""
+    """Card of version 1.0.0 and USB drives with the updates 1.1.0 and, broken, 1.2.0; `key`: confirmed for SSH."""
 
+    key: Path
     card: Path
     good: Path
     broken: Path
@@ -101,8 +104,17 @@ def builds(tmp_path_factory: pytest.TempPathFactory) -> Builds:
     }.items():
         (broken / name).parent.mkdir(parents=True, exist_ok=True)
         (broken / name).write_text(text)
-    card, good, bad = build(folder, "1.0.0"), build(folder, "1.1.0"), build(folder, "1.2.0", broken)
-    made = Builds(card / "diffuscope.img", drive_with_update(folder, good), drive_with_update(folder, bad))
+    run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / "key")
+    confirmed = folder / "confirmed"  # in place of an administrator at the device
+    for name, text in {
+        "etc/diffuscope/ssh-keys.json": json.dumps({fingerprint((folder / "key.pub").read_text()): True}),
+        "etc/systemd/system/diffuscope-identity.service.d/confirmed.conf": CONFIRMED,
+    }.items():
+        (confirmed / name).parent.mkdir(parents=True, exist_ok=True)
+        (confirmed / name).write_text(text)
+    card, good, bad = build(folder, "1.0.0", confirmed), build(folder, "1.1.0"), build(folder, "1.2.0", broken)
+    drives = [drive_with_update(folder, files) for files in (good, bad)]
+    made = Builds(folder / "key", card / "diffuscope.img", *drives)
     say(f"card and two updates built in {time.monotonic() - begin_s:.0f} s")
     return made
 
@@ -111,13 +123,12 @@ def builds(tmp_path_factory: pytest.TempPathFactory) -> Builds:
 def board(builds: Builds, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Board]:
     """Board with a new card in which a person has put the settings."""
     folder = tmp_path_factory.mktemp("board")
-    run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / "key")
     card = Card(builds.card)
     card.grow(CARD_MB)
     settings = folder / "diffuscope.toml"
-    settings.write_text(SETTINGS % (folder / "key.pub").read_text().strip())
+    settings.write_text(SETTINGS % builds.key.with_suffix(".pub").read_text().strip())
     card.write("chooser", settings)
-    board = Board(folder, ARCH, card, folder / "key")
+    board = Board(folder, ARCH, card, builds.key)
     yield board
     board.cut_power()
 

@@ -1,5 +1,6 @@
 """HTTP transcripts of every endpoint, good and refused, one per chapter, and the OpenAPI document."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 from device.clock import boot_id
 from services.delivery.upload_worker import BACKOFF_FIRST_S
 from services.identity.setup_code import FILE
+from services.identity.ssh_keys import fingerprint
 from tests.golden import compare
 from tests.golden.instrument import Refusing, instrument, until
 from tests.golden.transcript import Transcript
@@ -17,6 +19,7 @@ RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, whic
 LENSES = "/api/calibration/trial-lenses"
 ASHA, STANDS = {"name": "Asha", "secret": "274913"}, ("cap", "screen", "point")
 CODE = "ABCDEFGH"
+SSH_KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIGJcPFbe5hVKaLZ4yKkYbCzW1Sxd0hNnT0y0vN3hX4bQ me@laptop"
 NO_USER: dict[str, Any] = {"note": "no user: sent through a proxy", "headers": {"X-Forwarded-For": "10.42.0.7"}}
 
 
@@ -262,6 +265,7 @@ def access() -> list[dict[str, Any]]:
         _users(log)
         log.ask("GET /api/audit", "/api/audit?action=sign-in&limit=2")
         _clock(log)
+        _ssh_keys(log)
         _erasure(log)
         log.ask("POST /api/login/activity")
         log.ask("POST /api/login/confirm", json={"secret": "000000"})
@@ -296,6 +300,16 @@ def _clock(log: Transcript) -> None:
     log.ask("POST /api/clock", json=log.key(**earlier), note="before the time of the device")
     log.ask("POST /api/clock", json=log.key(**later))
     log.ask("POST /api/clock/back", json=log.key(**earlier))
+
+
+def _ssh_keys(log: Transcript) -> None:
+    """Record the decision on a key of the card, at a device without a button by its own screen."""
+    file = log.instrument.folder / "system/run/diffuscope-settings/ssh-keys.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps([SSH_KEY]))
+    log.ask("GET /api/ssh-keys")
+    log.ask("POST /api/ssh-keys", json={"fingerprint": "SHA256:other", "confirmed": True})
+    log.ask("POST /api/ssh-keys", json={"fingerprint": fingerprint(SSH_KEY), "confirmed": True})
 
 
 def _erasure(log: Transcript) -> None:

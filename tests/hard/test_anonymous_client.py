@@ -26,7 +26,7 @@ import pytest
 
 from device.clock import SystemClock
 from services.errors import UpdateDuringExam
-from services.http.access import ACCESS
+from services.http.access import OPERATIONS
 from services.identity.certificates import create_authority, create_server_certificate
 from services.update.preconditions import EXAM_S, refuse_while_in_use
 from tests.browser.conftest import copy_small_plans, free_port
@@ -49,7 +49,7 @@ os.environ |= {"LISTEN_PID": str(os.getpid()), "LISTEN_FDS": "3", "LISTEN_FDNAME
 os.execv(sys.executable, [sys.executable, "-m", "services", "run", *sys.argv[7:]])
 """
 OWN_WORK = {"audit-log.jsonl", "audit-head.json", "access/lock-out.json", "reserve.bin"}
-PUBLIC = {operation for operation, access in ACCESS.items() if access.from_anywhere}
+PUBLIC = {operation for operation, (access, _) in OPERATIONS.items() if access.from_anywhere}
 MAX_SLOWER_S = 5.0  # a press of the small head takes 1 s
 
 

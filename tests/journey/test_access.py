@@ -1,6 +1,7 @@
 """Access control: every endpoint with every role, without a login, and with an ended one; set-up and users."""
 
 import asyncio
+import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -29,6 +30,7 @@ from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
 from services.identity.logins import IDLE_LOCK_S
 from services.identity.setup_code import SetupCode
+from services.identity.ssh_keys import decisions, fingerprint
 from services.identity.users import ROLES, Role
 from services.records.audit_log import AuditLog
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
@@ -292,6 +294,42 @@ def test_a_forgotten_administrator_needs_code_and_button(make_rig: MakeRig, hand
     entries = log.entries(100, action="reset-administrator")
     assert [entry.more["status"] for entry in entries].count("200") == 1
     assert len(entries) == 9
+
+
+@pytest.mark.parametrize("has_button", [True, False])
+def test_a_key_for_ssh_is_confirmed_at_the_device_by_an_administrator(
+    make_rig: MakeRig, handle: World, tmp_path: Path, has_button: bool
+) -> None:
+    rig = make_rig(head=lambda head: replace(head, button=SimButton(handle) if has_button else None))
+    add_users(rig)
+    log, key = AuditLog(tmp_path, b"k" * 32, rig.clock), "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIGJcPFbe me@laptop"
+    (tmp_path / "run/diffuscope-settings").mkdir(parents=True)
+    (tmp_path / "run/diffuscope-settings/ssh-keys.json").write_text(json.dumps([key]))
+    app, login = create_app(rig.arbiter, rig.authenticator, audit_log=log, system=tmp_path).http, tokens(rig)
+    (listed,) = ask(app, "GET", "/api/ssh-keys", login["administrator"]).json()["keys"]
+    assert listed == {"fingerprint": fingerprint(key), "comment": "me@laptop", "confirmed": None}
+
+    def decided(client: tuple[str, int], confirmed: bool = True, shown: str = listed["fingerprint"]) -> tuple[int, Any]:
+        body = {"fingerprint": shown, "confirmed": confirmed}
+        answer = ask(app, "POST", "/api/ssh-keys", login["administrator"], client, json=body).json()
+        return answer.get("code"), [one["confirmed"] for one in answer.get("keys", ())]
+
+    assert decided(AWAY) == ("access.presence", [])
+    if has_button:
+        assert decided(HERE) == ("access.presence", []), "no button was pressed"
+        handle.pressed_since_s = rig.clock.now_s()
+        until(lambda: rig.arbiter.pressed_s == 0)
+    present = AWAY if has_button else HERE
+    assert decided(present, shown="SHA256:other") == ("store.unknown", [])
+    assert decisions(rig.store.folder) == {}
+    assert decided(present) == (None, [True])
+    assert decided(present, confirmed=False) == (None, [False])
+    assert decisions(rig.store.folder) == {fingerprint(key): False}
+    entries = [entry for entry in log.entries(9, action="decide-ssh-key") if entry.more["status"] == "200"]
+    assert [(entry.user, entry.record, entry.more["field"]) for entry in entries] == [
+        ("administrator", fingerprint(key), "refused"),
+        ("administrator", fingerprint(key), "confirmed"),
+    ]
 
 
 def test_without_a_button_the_screen_of_the_device_creates_a_further_administrator(fresh: Rig) -> None:

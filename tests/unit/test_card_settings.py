@@ -14,6 +14,7 @@ import pytest
 from services.identity import card_settings
 from services.identity.apply_settings import CardBoot, ethernet_profile, wifi_profile
 from services.identity.card_settings import CardSettings, Ethernet, Wifi, kept_settings, take_settings
+from services.identity.ssh_keys import decide, fingerprint
 from tests.companions import apple_double
 from tests.project_files import ROOT, text
 
@@ -34,7 +35,7 @@ keys = ["{KEY}"]
 @pytest.fixture
 def card(tmp_path: Path) -> CardBoot:
     """Root file system of a card with a data partition, the heads of the release, and one time zone."""
-    for name in ("boot/chooser", "data", "opt/diffuscope", "etc/diffuscope", "usr/share/zoneinfo/Asia"):
+    for name in ("boot/chooser", "data/captures", "opt/diffuscope", "etc/diffuscope", "usr/share/zoneinfo/Asia"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "usr/share/zoneinfo/Asia/Kolkata").touch()
     (tmp_path / "usr/share/zoneinfo/iso3166.tab").write_text("# codes\nIN\tIndia\nKE\tKenya\n")
@@ -61,6 +62,7 @@ def files_with(folder: Path, secret: str) -> list[str]:
 def test_settings_are_taken_kept_and_applied_at_every_boot(card: CardBoot) -> None:
     """The second boot has the stars, the third no file at all, as after an update of the boot partition."""
     file = write(card, GOOD)
+    decide(card.root / "data/captures", fingerprint(KEY), confirmed=True)
     for boot in range(3):
         volatile(card)
         assert card.run() is None, boot
@@ -140,6 +142,41 @@ def test_nonsense_is_reported_and_the_kept_settings_stay(card: CardBoot, change:
     write(card, GOOD)
     assert card.run() is None
     assert not (card.root / "run/diffuscope-settings/problem.json").exists()
+
+
+def ssh_keys_of_boot(card: CardBoot, settings: str) -> tuple[list[str], list[str]]:
+    """Boot with these settings; return the keys that are asked for, and those that may log in."""
+    volatile(card)
+    write(card, settings)
+    assert card.run() is None
+    asked = json.loads((card.root / "run/diffuscope-settings/ssh-keys.json").read_text())
+    applied = card.root / "run/diffuscope-ssh/authorized_keys"
+    return asked, applied.read_text().splitlines() if applied.exists() else []
+
+
+def test_a_key_for_ssh_is_applied_after_a_confirmation_only_and_a_changed_one_asks_again(card: CardBoot) -> None:
+    """A person with the card writes a key into its unsigned file."""
+    data, other, without = card.root / "data/captures", KEY.replace("bQ me", "bA me"), GOOD.partition("[ssh]")[0]
+    two = GOOD.replace(KEY, f'{KEY}", "{other}')
+    assert ssh_keys_of_boot(card, GOOD) == ([KEY], [])
+    decide(data, fingerprint(KEY), confirmed=True)
+    assert ssh_keys_of_boot(card, GOOD) == ([KEY], [KEY])
+    assert ssh_keys_of_boot(card, two) == ([KEY, other], [KEY])
+    decide(data, fingerprint(other), confirmed=False)
+    assert ssh_keys_of_boot(card, two) == ([KEY, other], [KEY])
+    assert ssh_keys_of_boot(card, GOOD.replace(KEY, other)) == ([other], [])
+    assert ssh_keys_of_boot(card, GOOD) == ([KEY], []), "the key was changed meanwhile"
+    decide(data, fingerprint(KEY), confirmed=True)
+    assert ssh_keys_of_boot(card, without) == ([], [])
+    assert ssh_keys_of_boot(card, GOOD) == ([KEY], []), "the key was removed meanwhile"
+    (data / "ssh-keys.json").write_text("no JSON")
+    assert ssh_keys_of_boot(card, GOOD) == ([KEY], [])
+
+
+def test_the_fingerprint_is_that_of_ssh_keygen(tmp_path: Path) -> None:
+    (tmp_path / "key.pub").write_text(KEY)
+    words = ["ssh-keygen", "-lf", str(tmp_path / "key.pub")]
+    assert fingerprint(KEY) in subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
 def test_a_card_without_settings_boots_with_its_defaults_and_no_ssh(card: CardBoot) -> None:
@@ -264,6 +301,7 @@ def test_a_step_that_fails_is_reported_and_the_others_are_applied(card: CardBoot
     """What was in force stays: a damaged programme, a root without zones or a key that cannot be made costs itself."""
     boot = card.root / "boot/chooser"
     shutil.copyfile(ROOT / "services/records/programme.toml", boot / "programme.toml")
+    decide(card.root / "data/captures", fingerprint(KEY), confirmed=True)
     file = write(card, f'programme = "programme.toml"\n{GOOD}')
     assert card.run() is None
     file.unlink()

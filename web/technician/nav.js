@@ -8,6 +8,7 @@ import "./erasure.js";
 import "./health.js";
 import "./software_update.js";
 import "./stored_pictures.js";
+import "./ssh_keys.js";
 import "./users.js";
 import { html } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
@@ -19,7 +20,7 @@ const SECTIONS = {
   "event-log": html`<instrument-event-log class="column"></instrument-event-log>`,
   backup: html`<instrument-backup class="column"></instrument-backup>`,
   space: html`<stored-pictures class="column"></stored-pictures>`,
-  users: html`<instrument-users class="column"></instrument-users>`,
+  users: html`<instrument-users class="column"></instrument-users><ssh-keys class="column"></ssh-keys>`,
   erase: html`<patient-erasure class="column"></patient-erasure>`,
   audit: html`<instrument-audit class="column"></instrument-audit>`,
   update: html`<software-update class="column"></software-update>`,
