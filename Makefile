@@ -115,7 +115,7 @@ INSTRUMENT_FAULTS := $(addprefix tests/journey/,test_fault_states.py test_calibr
 # Minutes each: 1,250 damages, of which `make test` has a sample; pictures, layouts and a calibration of lenslets; the maker's chart; hard frames
 # of several eyes, of which `make test-faults` has the grid; montages; guided calibrations, updates, hasty fingers and every
 # alert in every language on the page, whose server side `make test-faults` tries; what moves on the page in every size.
-LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_edits.py journey/test_roles.py hard/test_full_field.py hard/test_quality.py hard/test_background.py hard/test_flicker.py \
+LONG := $(addprefix tests/,hard/test_store_damage.py hard/test_edits.py hard/test_anonymous_client.py journey/test_roles.py hard/test_full_field.py hard/test_quality.py hard/test_background.py hard/test_flicker.py \
 	hard/test_far_eyes.py hard/test_ghost.py hard/test_cut_pupils.py hard/test_spots.py hard/test_dark_border.py hard/test_uneven_light.py hard/test_sensor_lines.py \
 	hard/test_given_field.py physics/test_lenslets.py physics/test_lens_design.py physics/test_lens_pictures.py \
 	physics/test_independent_lens_frames.py \
@@ -148,7 +148,7 @@ test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad fr
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
 	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR $(LONG_PAGES) $(filter-out $(LONG_PAGES) $(LONG) $(JOURNEYS),$(call tests_of,tests/browser))
 
-test-long: .venv/kernels browser strace ## Try 1,250 damages of a store, lenslets, hard frames of several eyes, montages, every alert, guided calibrations on the page.
+test-long: .venv/kernels browser strace ## Try 1,250 damages of a store, a client of the network without a login (as root), lenslets, hard frames of several eyes, montages, every alert, guided calibrations on the page.
 	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(LONG)
 
 page-pictures: .venv/ready browser ## Take README's two pictures of the page again, on the real server with the simulated head.

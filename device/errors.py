@@ -286,18 +286,18 @@ class StoreError(DiffuscopeError):
     """A file, record or folder of the instrument cannot be written or read."""
 
     code = "store"
-    default_remedy = "The picture could not be kept. Call the technician."
+    default_remedy = "The picture could not be saved. Call the technician."
 
 
 class StoreFull(StoreError):
     """There is not enough free space on this device, for a capture or another copy of the records."""
 
     code = "store.full"
-    default_remedy = "No space left. Nothing that was kept is lost. Copy pictures to a USB stick and remove old ones."
+    default_remedy = "No space left. Nothing that was saved is lost. Copy pictures to a USB stick and remove old ones."
 
 
 class StoreReadOnly(StoreError):
     """The disk takes no changes: it is mounted read-only, fails, or belongs to another user."""
 
     code = "store.readonly"
-    default_remedy = "Nothing that was kept is lost. Copy to a USB stick or send, and call the technician."
+    default_remedy = "Nothing that was saved is lost. Copy to a USB stick or send, and call the technician."

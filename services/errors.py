@@ -68,7 +68,7 @@ from device.errors import DiffuscopeError, StoreError
 
 # Remedy of StoreFull where free files (inodes) lack, not free bytes.
 NO_FILES_REMEDY = (
-    "The disk takes no more files, although it has free bytes. Nothing that was kept is lost. Copy pictures to a USB "
+    "The disk takes no more files, although it has free bytes. Nothing that was saved is lost. Copy pictures to a USB "
     "stick and remove old ones, or call the technician: another program may have filled the disk with small files."
 )
 
@@ -147,7 +147,7 @@ class ControlLeaseHeld(RequestRefused):
     """Another screen holds the control lease."""
 
     code = "link.other"
-    default_remedy = "Another screen is taking pictures."
+    default_remedy = "Another tablet is using the camera."
 
 
 class CrossOriginRequest(RequestRefused):
@@ -203,28 +203,28 @@ class VisitFinished(RequestRefused):
     """The visit is finished and read-only."""
 
     code = "visit.finished"
-    default_remedy = "This visit is finished. Begin a new visit for this person."
+    default_remedy = "This visit is finished. Begin a new visit for this patient."
 
 
 class ConsentMissing(RequestRefused):
     """No consent is recorded for the visit: no light, neither for a picture nor for aiming."""
 
     code = "consent.missing"
-    default_remedy = "First ask the person: may we take pictures of the eyes? Then choose the answer."
+    default_remedy = "Ask the patient first. Then choose the answer."
 
 
 class ConsentDeclined(RequestRefused):
     """Consent was declined or withdrawn: no light, neither for a picture nor for aiming."""
 
     code = "consent.declined"
-    default_remedy = "This person did not agree. Take no pictures, and finish the visit."
+    default_remedy = "This patient did not agree. Take no pictures, and finish the visit."
 
 
 class StoreDamaged(StoreError):
     """A stored file or database row is missing, unreadable or invalid, or a digest differs from the stored one."""
 
     code = "store.damaged"
-    default_remedy = "This kept file is damaged. Copy what can be read and call the technician."
+    default_remedy = "This saved file is damaged. Copy what can be read and call the technician."
 
 
 class StoreLocked(StoreError):
@@ -233,7 +233,7 @@ class StoreLocked(StoreError):
     code = "store.locked"
     default_remedy = (
         "Another program is writing to the database of this device: close it, a database viewer or a copy of the "
-        "folder, then try again. Nothing that was kept is lost."
+        "folder, then try again. Nothing that was saved is lost."
     )
 
 
@@ -299,7 +299,7 @@ class RecordErased(StoreError):
     """The data of the patient were erased: their key is gone, and with it the content of every copy."""
 
     code = "store.erased"
-    default_remedy = "The data of this person were erased, as was asked for. Begin a new visit if they come again."
+    default_remedy = "The data of this patient were erased on request. If the patient comes again, begin a new visit."
 
 
 class RecordNotFound(StoreError, LookupError):
@@ -422,7 +422,7 @@ class UpdateUnreachable(UpdateError):
     """The update server does not answer, or the connection was lost."""
 
     code = "update.link"
-    default_remedy = "The connection was lost. What has arrived is kept: try again later, and it goes on from there."
+    default_remedy = "The connection was lost. What has arrived is saved: try again later, and it goes on from there."
 
 
 class UpdateSourceRemoved(UpdateError):
@@ -478,7 +478,7 @@ class UpdateNoRoom(UpdateError):
     """There is no space for the update."""
 
     code = "update.room"
-    default_remedy = "Copy pictures to a USB stick and remove old ones, then try again. Nothing that was kept is lost."
+    default_remedy = "Copy pictures to a USB stick and remove old ones, then try again. Nothing that was saved is lost."
 
 
 class UpdateFailed(UpdateError):

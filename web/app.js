@@ -8,7 +8,6 @@ import { page } from "./screens/page_layout.js";
 import { goOnWhenShown, stay } from "./core/going_on.js";
 import { bindKeys } from "./core/keyboard.js";
 import { checkLogin, reportActivity } from "./core/login.js";
-import "./components/user_login.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
 import { resetPictureTools, captureEventHandlers, openPicture, rejectForeignCapture } from "./core/capture.js";
@@ -38,7 +37,7 @@ async function showRoute(route) {
   if (!same) lowerAlerts(({ from }) => from === "press");
   if (route.visit !== before.visit) lowerAlert("shot.crossed");
   if (route.screen !== "outcome") set({ finishing: null });
-  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, qrCode: null });
+  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, isCodeShown: false });
   buttonsChanged();
   lowerAlert("link.slow");
   if (route.screen !== "pictures" || route.visit !== before.visit) set({ montages: Object.freeze({}), changes: Object.freeze([]) });
@@ -81,6 +80,18 @@ async function loadModule(name) {
   }
 }
 
+// The dialog of the login is loaded when it is needed first; without a link, when it is asked for again.
+async function loadLogin({ detail }) {
+  if (customElements.get("user-login")) return;
+  try {
+    await import("./components/user_login.js");
+  } catch (problem) {
+    if (problem instanceof TypeError) return;
+    throw problem;
+  }
+  document.dispatchEvent(new CustomEvent("login-required", { detail }));
+}
+
 async function loadRoute(route) {
   for (const name of MODULES_OF_SCREEN[route.screen] ?? []) loadModule(name);
   if (route.screen === "home") refreshHome();
@@ -118,7 +129,7 @@ function leaveVisit() {
 
 // Initial keyboard focus of each screen.
 const SHUTTER = "#shutter";
-const FOCUS = { aim: SHUTTER, picture: SHUTTER, home: "#new", outcome: "#done" };
+const FOCUS = { aim: SHUTTER, picture: SHUTTER, home: "#new", outcome: "#outcome-title" };
 const focusScreen = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScroll: true });
 
 // ---- server events
@@ -176,6 +187,8 @@ async function refresh() {
 addEventListener("pagehide", releaseControl);
 
 for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => get().user && reportActivity(), { passive: true });
+
+document.addEventListener("login-required", (event) => loadLogin(/** @type {CustomEvent} */ (event)));
 
 // A user has signed in: what the page shows stays, and is read again.
 document.addEventListener("login-changed", (event) => {

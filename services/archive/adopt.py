@@ -24,6 +24,7 @@ from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
 from services.records.capture_versions import NewVersion, unknown_capture
 from services.records.device_identity import read_device
+from services.records.earlier_stores import require_store
 from services.records.snapshots import refuse_in_use
 from services.records.storage_errors import storage_errors
 
@@ -59,8 +60,7 @@ def adopt_results(folder: Path, store: Path, clock: Clock, progress: Callable[[s
     """
     if not (folder / PLAN).is_file():
         raise SettingError(f"{folder} holds no run", "Give the folder of diffuscope archive run.")
-    if not (store / "captures").is_dir():
-        raise RecordNotFound(f"{store} holds no captures", "Give the folder of the captures with --data.")
+    require_store(store / schema.DATABASE)
     plan = read_plan(folder / PLAN)
     results = ResultFolder(folder)
     with ExitStack() as undo:

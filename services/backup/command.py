@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from device.clock import SystemClock
-from device.errors import SpecError
 from device.user_files import read_text
 from services.backup.store_command import Data, app, table
 from services.identity.audit_key import find_audit_key
@@ -113,10 +112,7 @@ def _secret_key(header: "BackupHeader", identity: Path | None, passphrase_file: 
 
 
 def _first_line(path: Path) -> str:
-    try:
-        return read_text(path).partition("\n")[0]
-    except SpecError as error:
-        raise typer.BadParameter(error.message) from error
+    return read_text(path).partition("\n")[0]
 
 
 def _percent(verb: str) -> Callable[[int, int], None]:

@@ -11,7 +11,6 @@ import typer
 from device import atomic_io
 from device.clock import SystemClock
 from device.user_files import files_in
-from services.errors import RecordNotFound
 from services.identity.audit_key import find_audit_key, load_or_create_audit_key
 from services.records.audit_log import AuditLog
 from services.running_time import announced, announcing, say
@@ -67,11 +66,12 @@ def copy(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the copies, a folder for each capture.")],
 ) -> None:
     """Copy captures without encryption: raw frames, pictures and report; they are pictures of a person."""
-    from services.records.capture_store import CaptureStore  # deferred: imports SQLAlchemy
+    from services.records import schema  # deferred: imports SQLAlchemy
+    from services.records.capture_store import CaptureStore
+    from services.records.earlier_stores import require_store
     from services.records.storage_errors import storage_errors
 
-    if not (data / "captures").is_dir():
-        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    require_store(data / schema.DATABASE)
     key = load_or_create_audit_key(data)
     with CaptureStore(data, key=key) as store, storage_errors():
         atomic_io.make_folder(output)
@@ -92,13 +92,14 @@ def research(
     They are still pictures of persons: a retina identifies a person of whom another picture is known.
     """
     from services.delivery.research_export import research_folders  # deferred: imports SQLAlchemy
+    from services.records import schema
     from services.records.capture_store import CaptureStore
+    from services.records.earlier_stores import require_store
     from services.records.storage_errors import storage_errors
 
     if output.exists():
         raise typer.BadParameter(f"{output} exists; give a new folder")
-    if not (data / "captures").is_dir():
-        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    require_store(data / schema.DATABASE)
     key = load_or_create_audit_key(data)
     AuditLog(data, key, SystemClock()).append("", "export-research", by="command")
     with CaptureStore(data, key=key) as store, storage_errors():

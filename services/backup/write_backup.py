@@ -11,9 +11,9 @@ from device.errors import StoreError
 from services.backup import store_contents
 from services.backup.backup_folder import BackupFolder
 from services.backup.backup_key import BackupKey, LastBackup, read_key, write_key
-from services.errors import BackupKeyWrong, RecordNotFound
+from services.errors import BackupKeyWrong
 from services.records import patient_keys, schema
-from services.records.earlier_stores import refuse_earlier_store
+from services.records.earlier_stores import require_store
 from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
@@ -42,9 +42,7 @@ def write_backup(
     stick does not return what was written, or has a folder of other backups), UsbDriveFull, UsbDriveUnavailable,
     StoreDamaged, StoreError.
     """
-    if not (store / "captures").is_dir():
-        raise RecordNotFound(f"{store} holds no captures", "Give the folder of the captures with --data.")
-    refuse_earlier_store(store / schema.DATABASE)
+    require_store(store / schema.DATABASE)
     with storage_errors():
         key = new_key or read_key(store)
         if key is None:

@@ -173,11 +173,13 @@ def database(facts: StatusSnapshot) -> Check:
         problems.append(f"{_count(len(facts.recovery.conflicts), 'record has', 'records have')} a second state")
     if facts.recovery.missing:
         problems.append(f"{_count(len(facts.recovery.missing), 'chosen picture is', 'chosen pictures are')} gone")
+    if facts.recovery.lost_visits:
+        problems.append(f"{_count(len(facts.recovery.lost_visits), 'visit is', 'visits are')} gone")
     remedy = DATABASE_REMEDY if problems else ""
     return Check("database", not problems, "; ".join(problems) or "whole", "whole at the last start", remedy)
 
 
-DATABASE_REMEDY = "What is listed is the newest state; what it replaced is kept. If this comes back, replace the card."
+DATABASE_REMEDY = "What is listed is the newest state; what it replaced is saved. If this comes back, replace the card."
 ORPHANS_REMEDY = (
     "Pictures without an entry are not listed. They stay on the disk: remove nothing, copy the folder of the captures "
     "to another disk, and call the technician."
@@ -195,12 +197,12 @@ def space(facts: StatusSnapshot) -> Check:
     Free bytes and free files (inodes) count. Quarantined captures count as free space; their number and size are in the
     value.
     """
-    people = facts.people_left
+    left = facts.people_left
     torn = facts.torn_bytes
-    value = f"plenty, more than {MAX_SHOWN_VISITS} people" if thresholds.are_many_visits(people) else f"{people} people"
+    value = f"plenty, more than {MAX_SHOWN_VISITS} patients" if thresholds.are_many_visits(left) else f"{left} patients"
     if torn:
-        value += f"; half-kept pictures aside: {len(torn)}, {math.ceil(sum(torn) / 1e6)} MB"
-    ok = not thresholds.are_few_visits(people)
+        value += f"; half-saved pictures aside: {len(torn)}, {math.ceil(sum(torn) / 1e6)} MB"
+    ok = not thresholds.are_few_visits(left)
     remedy = "Copy captures away and make room."
     if not ok and facts.lacks_files:
         value, remedy = f"{value}; the disk takes few more files", NO_FILES_REMEDY

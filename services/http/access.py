@@ -1,4 +1,4 @@
-"""Access control: the table endpoint x role, and the dependency of the application that enforces it.
+"""Access control: the table of operations with their roles and actions, and the dependency that enforces the roles.
 
 An operation that is not in the table is refused. The table grants by role; two rules need the body of a request and
 are here too: light with a visit is the screener's, light without one (a test picture) is the technician's.
@@ -48,89 +48,91 @@ KEYS = Access(frozenset({"technician", "administrator"}), confirmed=True)
 ADMINISTRATION = Access(frozenset({"administrator"}))
 USERS = Access(frozenset({"administrator"}), confirmed=True)
 
-ACCESS: dict[str, Access] = {
-    "GET /": PUBLIC,
-    "GET /technician": PUBLIC,
-    "GET /web/{name:path}": PUBLIC,
-    "GET /api/login": PUBLIC,
-    "POST /api/login": PUBLIC,
-    "DELETE /api/login": PUBLIC,
-    "POST /api/login/activity": ANY_USER,
-    "POST /api/login/confirm": ANY_USER,
-    "PUT /api/login/secret": ANY_USER,
-    "POST /api/setup": PUBLIC,
-    "GET /api/users": USERS,
-    "POST /api/users": USERS,
-    "PATCH /api/users/{name}": USERS,
-    "DELETE /api/users/{name}": USERS,
-    "GET /api/ssh-keys": ADMINISTRATION,
-    "POST /api/ssh-keys": USERS,
-    "GET /api/openapi.json": ANY_USER,
-    "GET /api/audit": ADMINISTRATION,
-    "GET /api/status": MONITORED,
-    "GET /api/health": MONITORED,
-    "GET /api/programme": ANY_USER,
-    "POST /api/clock": ANY_USER,
-    "POST /api/clock/back": USERS,
-    "GET /api/events": ANY_USER,
-    "POST /api/controller": SCREEN,
-    "GET /api/preview": LIGHT,
-    "POST /api/captures": LIGHT,
-    "GET /api/captures": PICTURES,
-    "GET /api/captures/{id}": PICTURES,
-    "GET /api/captures/{id}/{name}": PICTURES,
-    "POST /api/captures/{id}/accept": EXAM,
-    "POST /api/captures/{id}/eye": EXAM,
-    "GET /api/visits": READ,
-    "POST /api/visits": EXAM,
-    "GET /api/visits/{id}": READ,
-    "GET /api/visits/{id}/changes": READ,
-    "PATCH /api/visits/{id}": EXAM,
-    "POST /api/visits/{id}/slots": EXAM,
-    "POST /api/visits/{id}/not-possible": EXAM,
-    "POST /api/visits/{id}/finish": EXAM,
-    "POST /api/visits/{id}/reopen": EXAM,
-    "GET /api/visits/{id}/montage/{eye}": READ,
-    "GET /api/visits/{id}/montage/{eye}/picture.png": READ,
-    "GET /api/patients": USERS,
-    "POST /api/patients/erase": USERS,
-    "GET /api/exports": READ,
-    "POST /api/visits/{id}/export": READ,
-    "GET /api/visits/{id}/export.zip": READ,
-    "GET /api/upload-queue": ANY_USER,
-    "POST /api/upload-queue/retry": UPLOADS,
-    "GET /api/calibration": SERVICE,
-    "POST /api/calibration": SERVICE,
-    "POST /api/calibration/ready": SERVICE,
-    "POST /api/calibration/cancel": SERVICE,
-    "POST /api/calibration/use": SERVICE,
-    "GET /api/calibration/preview": SERVICE,
-    "POST /api/calibration/trial-lenses": SERVICE,
-    "POST /api/calibration/trial-lenses/ready": SERVICE,
-    "GET /api/technician/accuracy": SERVICE,
-    "GET /api/technician/accuracy.svg": SERVICE,
-    "POST /api/technician/accuracy": SERVICE,
-    "PUT /api/technician/pace": SERVICE,
-    "GET /api/technician/captures/{id}/again.png": SERVICE,
-    "GET /api/technician/event-log": UPKEEP,
-    "GET /api/technician/event-log.txt": UPKEEP,
-    "POST /api/technician/event-log/export": UPKEEP,
-    "GET /api/technician/backup": UPKEEP,
-    "POST /api/technician/backup": UPKEEP,
-    "POST /api/technician/backup/passphrase": KEYS,
-    "GET /api/technician/removal": UPKEEP,
-    "POST /api/technician/removal": UPKEEP,
-    "POST /api/technician/removal/undo": UPKEEP,
-    "GET /api/update": UPKEEP,
-    "POST /api/update/check": UPKEEP,
-    "POST /api/update/install": UPKEEP,
-    "POST /api/update/restart": UPKEEP,
-    "PUT /api/update/file": UPKEEP,
+# Who may send an operation, and the action of it in the audit log. None: not recorded, since it is a page or a state of
+# the instrument, which names no patient, the next step of an action, or a sign that the user is there.
+OPERATIONS: dict[str, tuple[Access, str | None]] = {
+    "GET /": (PUBLIC, None),
+    "GET /technician": (PUBLIC, None),
+    "GET /web/{name:path}": (PUBLIC, None),
+    "GET /api/login": (PUBLIC, None),
+    "POST /api/login": (PUBLIC, "sign-in"),
+    "DELETE /api/login": (PUBLIC, "sign-out"),
+    "POST /api/login/activity": (ANY_USER, None),
+    "POST /api/login/confirm": (ANY_USER, "confirm"),
+    "PUT /api/login/secret": (ANY_USER, "change-own-secret"),
+    "POST /api/setup": (PUBLIC, "set-up"),
+    "GET /api/users": (USERS, "list-users"),
+    "POST /api/users": (USERS, "add-user"),
+    "PATCH /api/users/{name}": (USERS, "change-user"),
+    "DELETE /api/users/{name}": (USERS, "remove-user"),
+    "GET /api/ssh-keys": (ADMINISTRATION, None),
+    "POST /api/ssh-keys": (USERS, "decide-ssh-key"),
+    "GET /api/openapi.json": (ANY_USER, None),
+    "GET /api/audit": (ADMINISTRATION, "read-audit"),
+    "GET /api/status": (MONITORED, None),
+    "GET /api/health": (MONITORED, None),
+    "GET /api/programme": (ANY_USER, None),
+    "POST /api/clock": (ANY_USER, "set-clock"),
+    "POST /api/clock/back": (USERS, "set-clock-back"),
+    "GET /api/events": (ANY_USER, None),
+    "POST /api/controller": (SCREEN, "hold-camera"),
+    "GET /api/preview": (LIGHT, None),
+    "POST /api/captures": (LIGHT, "capture"),
+    "GET /api/captures": (PICTURES, "list-pictures"),
+    "GET /api/captures/{id}": (PICTURES, "view"),
+    "GET /api/captures/{id}/{name}": (PICTURES, "view"),
+    "POST /api/captures/{id}/accept": (EXAM, "accept-picture"),
+    "POST /api/captures/{id}/eye": (EXAM, "change-eye"),
+    "GET /api/visits": (READ, "list-visits"),
+    "POST /api/visits": (EXAM, "begin-visit"),
+    "GET /api/visits/{id}": (READ, "view"),
+    "GET /api/visits/{id}/changes": (READ, "view"),
+    "PATCH /api/visits/{id}": (EXAM, "answer"),
+    "POST /api/visits/{id}/slots": (EXAM, "choose-picture"),
+    "POST /api/visits/{id}/not-possible": (EXAM, "not-possible"),
+    "POST /api/visits/{id}/finish": (EXAM, "finish"),
+    "POST /api/visits/{id}/reopen": (EXAM, "reopen"),
+    "GET /api/visits/{id}/montage/{eye}": (READ, "view"),
+    "GET /api/visits/{id}/montage/{eye}/picture.png": (READ, "view"),
+    "GET /api/patients": (USERS, "find-patient"),
+    "POST /api/patients/erase": (USERS, "erase-patient"),
+    "GET /api/exports": (READ, None),
+    "POST /api/visits/{id}/export": (READ, "export"),
+    "GET /api/visits/{id}/export.zip": (READ, "export"),
+    "GET /api/upload-queue": (ANY_USER, None),
+    "POST /api/upload-queue/retry": (UPLOADS, "retry-upload"),
+    "GET /api/calibration": (SERVICE, None),
+    "POST /api/calibration": (SERVICE, "calibrate"),
+    "POST /api/calibration/ready": (SERVICE, None),
+    "POST /api/calibration/cancel": (SERVICE, "cancel-calibration"),
+    "POST /api/calibration/use": (SERVICE, "use-calibration"),
+    "GET /api/calibration/preview": (SERVICE, None),
+    "POST /api/calibration/trial-lenses": (SERVICE, "calibrate"),
+    "POST /api/calibration/trial-lenses/ready": (SERVICE, None),
+    "GET /api/technician/accuracy": (SERVICE, None),
+    "GET /api/technician/accuracy.svg": (SERVICE, None),
+    "POST /api/technician/accuracy": (SERVICE, "measure-accuracy"),
+    "PUT /api/technician/pace": (SERVICE, "set-time-budget"),
+    "GET /api/technician/captures/{id}/again.png": (SERVICE, "view"),
+    "GET /api/technician/event-log": (UPKEEP, "read-event-log"),
+    "GET /api/technician/event-log.txt": (UPKEEP, "read-event-log"),
+    "POST /api/technician/event-log/export": (UPKEEP, "export-event-log"),
+    "GET /api/technician/backup": (UPKEEP, None),
+    "POST /api/technician/backup": (UPKEEP, "backup"),
+    "POST /api/technician/backup/passphrase": (KEYS, "set-backup-passphrase"),
+    "GET /api/technician/removal": (UPKEEP, None),
+    "POST /api/technician/removal": (UPKEEP, "remove-pictures"),
+    "POST /api/technician/removal/undo": (UPKEEP, "bring-back-pictures"),
+    "GET /api/update": (UPKEEP, None),
+    "POST /api/update/check": (UPKEEP, "look-for-update"),
+    "POST /api/update/install": (UPKEEP, "update"),
+    "POST /api/update/restart": (UPKEEP, "restart"),
+    "PUT /api/update/file": (UPKEEP, "bring-update"),
 }
 
 
 def access_required(authenticator: Authenticator, rates: RateLimits) -> Callable[[Request], Awaitable[None]]:
-    """Return the dependency of every endpoint: it admits the user of a request by `ACCESS`, or raises.
+    """Return the dependency of every endpoint: it admits the user of a request by `OPERATIONS`, or raises.
 
     It leaves in `request.state` the `user` (None for a request without a login), `operation` and `audit_address` for
     the audit trail, and `is_admitted`, by which `may` asks for an operation while the request is open. LoginRequired,
@@ -140,16 +142,16 @@ def access_required(authenticator: Authenticator, rates: RateLimits) -> Callable
 
     async def admit(request: Request) -> None:
         operation = f"{request.method} {_template(request)}"
-        rule = ACCESS.get(operation)
-        if rule is None:
+        if operation not in OPERATIONS:
             raise AccessDenied(f"{operation} is not in the table of rights")
+        rule, _ = OPERATIONS[operation]
         token, peer = login_token(request), Peer.of(request)
         acts = rule.is_use and request.method not in SAFE_METHODS
         request.state.operation, request.state.audit_address = operation, peer.address
         request.state.user = None
         request.state.user = user = _admitted(authenticator, rule, token, peer, acts)
         rates.count(operation, peer.address if user is None else user.name)
-        request.state.is_admitted = lambda asked: _is_admitted(authenticator, ACCESS[asked], token, peer)
+        request.state.is_admitted = lambda asked: _is_admitted(authenticator, OPERATIONS[asked][0], token, peer)
 
     return admit
 
@@ -209,7 +211,7 @@ def require_light_role(request: Request, visit: str | None) -> None:
 
 
 def may(request: Request, operation: str) -> bool:
-    """Return whether the user of a request may also send `operation`, a key of `ACCESS`, now."""
+    """Return whether the user of a request may also send `operation`, a key of `OPERATIONS`, now."""
     try:
         return bool(request.state.is_admitted(operation))
     except StoreDamaged:  # no user is admitted; the device itself still reads its status

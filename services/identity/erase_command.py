@@ -8,7 +8,6 @@ import typer
 from device import atomic_io
 from device.clock import SystemClock
 from device.user_files import read_text
-from services.errors import RecordNotFound
 from services.identity.audit_key import read_audit_key
 from services.records.audit_log import AuditLog
 from services.records.visit import EraseReason
@@ -29,6 +28,7 @@ def patient(
     """Erase all that is stored of a patient, for good; stop the instrument first, make new backups afterwards."""
     from services.records import schema  # deferred: imports SQLAlchemy
     from services.records.capture_store import CaptureStore
+    from services.records.earlier_stores import require_store
     from services.records.snapshots import refuse_in_use
     from services.records.storage_errors import storage_errors
 
@@ -36,8 +36,7 @@ def patient(
         raise typer.BadParameter(f"{reason} is no reason; choose from {', '.join(get_args(EraseReason))}")
     if receipt.exists() or not receipt.absolute().parent.is_dir():
         raise typer.BadParameter(f"{receipt} cannot be a new file; choose another for the receipt")
-    if not (data / "captures").is_dir():
-        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    require_store(data / schema.DATABASE)
     refuse_in_use(data / schema.DATABASE)
     key, clock = read_audit_key(data), SystemClock()
     with CaptureStore(data, key=key) as store:

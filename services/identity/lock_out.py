@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
+from pydantic import BaseModel
+
 from device import atomic_io
 from device.clock import Clock
 from services.records import digested_json
-from services.records.json_values import JsonValue
 
 log = logging.getLogger(__name__)
 
@@ -17,6 +18,12 @@ FILE = "lock-out.json"
 MAX_WAIT_S, MAX_OWN_SCREEN_WAIT_S = 300.0, 60.0
 FORGOTTEN_S = 86_400.0
 MAX_ENTRIES = 500  # the oldest go first
+_Pair = tuple[str, str]  # account and address
+
+
+class _Content(BaseModel):
+    failures: tuple[tuple[str, str, int], ...]
+    known: tuple[_Pair, ...]
 
 
 @dataclass
@@ -29,15 +36,17 @@ class LockOut:
     """Wrong attempts by account and address, in a file of `folder`. Thread-safe.
 
     After n wrong attempts for one account, or from one address, the next has to wait 2^(n-1) s, at most `MAX_WAIT_S`;
-    at the device's own screen at most `MAX_OWN_SCREEN_WAIT_S`, so that a remote client cannot keep its users out. A
-    restart keeps the counts and begins each wait again: no step of the clock shortens one. An unreadable file is a full
-    wait for everybody.
+    at the device's own screen at most `MAX_OWN_SCREEN_WAIT_S`. An address from which an account signed in has its own
+    count for it, so that no other client keeps its user out there. A restart keeps the counts and begins each wait
+    again: no step of the clock shortens one. An unreadable file is a full wait for everybody.
     """
 
     def __init__(self, folder: Path, clock: Clock) -> None:
         self._file, self._clock = folder / FILE, clock
         self._lock = Lock()
-        self._failures, self._is_damaged = self._read()
+        self._failures: dict[_Pair, _Failures] = {}
+        self._known: dict[_Pair, None] = {}  # accounts that signed in, and from which address; the latest is the last
+        self._is_damaged = self._read()
         self._begun_s = clock.now_s()
 
     def wait_s(self, account: str, address: str, is_own_screen: bool) -> float:
@@ -45,8 +54,9 @@ class LockOut:
         limit_s = MAX_OWN_SCREEN_WAIT_S if is_own_screen else MAX_WAIT_S
         now_s = self._clock.now_s()
         with self._lock:
-            of_account = [failures for key, failures in self._failures.items() if key[0] == account]
-            of_address = [failures for key, failures in self._failures.items() if key[1] == address]
+            is_known, every = (account, address) in self._known, self._failures.items()
+            of_account = [one for key, one in every if key[0] == account and (key[1] == address or not is_known)]
+            of_address = [one for key, one in every if key[1] == address]
             ends_s = [_end_s(of_account, limit_s), _end_s(of_address, limit_s)]
             if self._is_damaged:
                 ends_s.append(self._begun_s + limit_s)
@@ -63,38 +73,36 @@ class LockOut:
             self._write()
 
     def record_success(self, account: str, address: str) -> None:
-        """Forget the wrong attempts for an account, and those from this address that were for it."""
+        """Forget the wrong attempts for an account from this address, from which it has its own count from now on."""
         with self._lock:
-            kept = {key: one for key, one in self._failures.items() if key[0] != account}
-            changed = len(kept) < len(self._failures)
-            self._failures = kept
+            pair = account, address
+            changed = self._failures.pop(pair, None) is not None or pair not in self._known
+            self._known.pop(pair, None)
+            self._known[pair] = None
+            self._known = dict.fromkeys(list(self._known)[-MAX_ENTRIES:])
             if changed:
                 self._write()
 
-    def _read(self) -> tuple[dict[tuple[str, str], _Failures], bool]:
+    def _read(self) -> bool:
+        """Take the counts of the file; return whether it cannot be read."""
+        now_s = self._clock.now_s()
         try:
-            rows = digested_json.decoded(self._file.read_bytes())["failures"]
-            now_s = self._clock.now_s()
-            if not isinstance(rows, list):
-                raise ValueError("no list")
-            found = {}
-            for row in rows:
-                if not isinstance(row, list):
-                    raise ValueError("no row")
-                account, address, count = row
-                found[str(account), str(address)] = _Failures(int(str(count)), now_s)
+            content = _Content.model_validate(digested_json.decoded(self._file.read_bytes()))
         except FileNotFoundError:
-            return {}, False
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            return False
+        except (OSError, ValueError) as error:
             log.warning("the wrong attempts to sign in cannot be read: %s", error)
-            return {}, True
-        return found, False
+            return True
+        self._failures = {(account, at): _Failures(count, now_s) for account, at, count in content.failures}
+        self._known = dict.fromkeys(content.known)
+        return False
 
     def _write(self) -> None:
-        rows: list[JsonValue] = [[*key, failures.count] for key, failures in self._failures.items()]
+        failures = tuple((*pair, one.count) for pair, one in self._failures.items())
+        content = _Content(failures=failures, known=tuple(self._known))
         try:
             atomic_io.make_private(self._file.parent)
-            atomic_io.write_atomically(self._file, digested_json.encoded({"failures": rows}))
+            atomic_io.write_atomically(self._file, digested_json.encoded(content.model_dump(mode="json")))
         except OSError as error:  # the count of this process is in force all the same
             log.warning("the wrong attempts to sign in cannot be stored: %s", error)
 

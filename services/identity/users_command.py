@@ -5,7 +5,6 @@ from typing import Annotated, cast
 
 import typer
 
-from device.errors import SpecError
 from device.user_files import read_text
 from services.identity.users import FOLDER, ROLES, Role, UserTable
 from services.running_time import announced
@@ -53,7 +52,4 @@ def list_users(data: Data) -> None:
 def _secret(file: Path | None) -> str:
     if file is None:
         return str(typer.prompt("PIN or passphrase", hide_input=True, confirmation_prompt=True))
-    try:
-        return read_text(file).partition("\n")[0]
-    except SpecError as error:
-        raise typer.BadParameter(error.message) from error
+    return read_text(file).partition("\n")[0]

@@ -133,7 +133,7 @@ class CalibrationSteps:
             except DiffuscopeError as error:
                 self._record_error(error)
             except OSError as error:
-                self._record_error(StoreFull(f"what was measured cannot be kept: {error}", STORE_FULL_REMEDY))
+                self._record_error(StoreFull(f"what was measured cannot be saved: {error}", STORE_FULL_REMEDY))
 
     def _await_request(self) -> RunRequest:
         while (now := self._run.now).request is None:

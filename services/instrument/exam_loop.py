@@ -47,7 +47,7 @@ LOCK_PATIENCE_S = 45.0  # for a locked database; the request that finishes a vis
 REFUSALS = (StoreFull, StoreLocked, StoreReadOnly, StoreDamaged)  # of the store: what it refuses can be stored later
 AGAIN = "Wait until it is back, then press again."
 UNTIL_BACK = "Wait until it is back."
-POSTPONED = "The frames of this picture are kept: the picture is made at the next start of the instrument."
+POSTPONED = "The frames of this picture are saved: it is processed at the next start of the instrument."
 
 
 @dataclass(frozen=True)

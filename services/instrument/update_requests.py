@@ -7,16 +7,18 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import BinaryIO
+
+from pydantic import BaseModel, ConfigDict
 
 from device import atomic_io
 from device.clock import Clock, boot_id
 from device.errors import InputError
 from services import resources
 from services.errors import UpdateBusy, UpdateFailed, UpdateNoRoom, UpdateWrongDevice
+from services.records.json_values import OmittedIfNone
 from services.update.ipc import (
     REQUEST_FILE,
     TABLET,
@@ -36,14 +38,15 @@ PICKUP_TIMEOUT_S = 90.0  # for the updater to take a request, on a busy computer
 NO_UPDATER_REMEDY = "Updates are for the device. On another computer, put the new version in as its README says."
 
 
-@dataclass(frozen=True)
-class UpdateStatus:
-    """State of an update: running version (`runs`), `state`, updates found, last error (`trouble`), release notes.
+class UpdateStatus(BaseModel):
+    """State of an update: running version (`runs`), `state`, updates found, last error (`trouble`), `news` of it.
 
-    `here` is False on a computer without an updater; then `version` and the fields after it are None. `version`: the
-    new version; `before`: the version that installed it; `share`: progress, 0 to 1; `offered`: newer version in the
-    channel; `looked`: a search was done since the last install; `took_s`: duration of the last committed update.
+    `here`: this computer has an updater. Only with an updater: the new `version`, the version `before` it, progress 0
+    to 1 (`share`), a newer version `offered` by the channel, and whether a search was done since the last install
+    (`looked`). `took_s`: duration of the last committed update in seconds. `news`: release notes.
     """
+
+    model_config = ConfigDict(frozen=True)
 
     here: bool
     runs: str
@@ -52,11 +55,11 @@ class UpdateStatus:
     trouble: StoredError | None = None
     news: tuple[str, ...] = ()
     took_s: float | None = None
-    version: str | None = None
-    before: str | None = None
-    share: float | None = None
-    offered: str | None = None
-    looked: bool | None = None
+    version: OmittedIfNone[str] = None
+    before: OmittedIfNone[str] = None
+    share: OmittedIfNone[float] = None
+    offered: OmittedIfNone[str] = None
+    looked: OmittedIfNone[bool] = None
 
 
 class BundleUpload:
@@ -168,7 +171,7 @@ class UpdateRequests:
                 yield BundleUpload(part, file, length)
         except OSError as error:
             if not atomic_io.is_full(error):
-                raise UpdateFailed(f"the file cannot be kept: {error.strerror}") from error
+                raise UpdateFailed(f"the file cannot be saved: {error.strerror}") from error
             raise UpdateNoRoom("the disk is full") from error
         finally:
             part.unlink(missing_ok=True)

@@ -7,7 +7,6 @@ import typer
 
 from device import atomic_io
 from device.clock import SystemClock
-from services.errors import RecordNotFound
 from services.running_time import announced, announcing
 
 if TYPE_CHECKING:
@@ -19,12 +18,10 @@ Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 
 def _snapshots(data: Path) -> "Snapshots":
     from services.records import schema  # deferred: imports SQLAlchemy
-    from services.records.earlier_stores import refuse_earlier_store
+    from services.records.earlier_stores import require_store
     from services.records.snapshots import Snapshots
 
-    if not (data / "captures").is_dir():
-        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
-    refuse_earlier_store(data / schema.DATABASE)
+    require_store(data / schema.DATABASE)
     return Snapshots(data / schema.DATABASE, SystemClock())
 
 

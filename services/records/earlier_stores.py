@@ -1,10 +1,14 @@
-"""Refusal of a data folder that a version before the first release wrote: its files are neither read nor changed."""
+"""Refusal of a data folder without captures, and of one that a version before the first release wrote.
+
+Its files are neither read nor changed.
+"""
 
 import sqlite3
 from contextlib import closing, suppress
 from pathlib import Path
 
 from device.errors import StoreError
+from services.errors import RecordNotFound
 
 EARLIER_NAMES = ("shelf.sqlite", "torn", "light.copy")  # database, quarantine, copy of the dose ledger
 FIRST_REVISION = "s0001"  # of the tables; revisions sort by time, and those before the first release began with "r"
@@ -25,6 +29,13 @@ def refuse_earlier_store(database: Path, what: str | None = None) -> None:
         with suppress(sqlite3.DatabaseError, UnicodeDecodeError), closing(sqlite3.connect(uri, uri=True)) as tables:
             for (revision,) in tables.execute("SELECT version_num FROM alembic_version").fetchall():
                 refuse_earlier_tables(revision, described)
+
+
+def require_store(database: Path) -> None:
+    """Raise RecordNotFound if the folder of `database` holds no captures; as `refuse_earlier_store` otherwise."""
+    if not database.with_name("captures").is_dir():
+        raise RecordNotFound(f"{database.parent} holds no captures", "Give the folder of the captures with --data.")
+    refuse_earlier_store(database)
 
 
 def refuse_earlier_tables(revision: str, described: str) -> None:

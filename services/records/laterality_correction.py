@@ -61,7 +61,7 @@ def slot_row_of(session: Session, capture: str) -> CaptureSlotRow:
         return shot
     if session.get(CaptureRow, capture) is None:
         raise RecordNotFound(f"there is no capture named {capture!r}")
-    raise RecordNotFound("this is a test picture: it belongs to no person", "Take the picture again for this person.")
+    raise RecordNotFound("this is a test picture: it belongs to no patient", "Take the picture again for this patient.")
 
 
 def requested_target(session: Session, capture: str) -> tuple[str, str | None, str | None]:
@@ -71,7 +71,7 @@ def requested_target(session: Session, capture: str) -> tuple[str, str | None, s
     """
     row = session.get(CaptureRow, capture)
     if row is None:
-        raise RecordNotFound("the picture of this press is not kept here", "Take the picture again.")
+        raise RecordNotFound("the picture of this press is not saved here", "Take the picture again.")
     report = _report(row)
     if report.moved:
         return report.moved[0].from_eye, report.visit, report.moved[0].from_slot

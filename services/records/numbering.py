@@ -79,5 +79,5 @@ def normalise(number: str) -> str:
     tidied = join_check_digit(number.strip().upper())
     if not _NUMBER.fullmatch(tidied):
         remedy = "Type up to 20 letters, digits or hyphens, or leave it empty for the next number."
-        raise InputError(f"number: {number[:40]!r} is not a number of a person", remedy)
+        raise InputError(f"number: {number[:40]!r} is not a number of a patient", remedy)
     return tidied

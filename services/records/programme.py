@@ -1,7 +1,7 @@
 """Screening programme, read from a TOML file: picture slots, reasons, referral, numbers, retention, exports."""
 
 from pathlib import Path
-from typing import Literal, Self, get_args
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
@@ -21,6 +21,8 @@ Vision = Literal["6/6", "6/9", "6/12", "6/18", "6/24", "6/36", "6/60", "CF", "HM
 VISIONS: tuple[Vision, ...] = get_args(
     Vision
 )  # visual acuity, best first; CF counting fingers, HM hand motion, LP and NLP light perception and none
+# by language, such as "en" or "hi"; English, where it is given, serves a language without a text
+Texts = dict[Annotated[str, Field(pattern="^[a-z]{2,3}$")], Annotated[str, Field(min_length=1, max_length=200)]]
 
 
 class Slot(Table):
@@ -33,10 +35,28 @@ class Slot(Table):
 
 
 class Referral(Table):
-    """Rules of referral: `vision_limit`, the lowest visual acuity that is not referred; telephone of the centre."""
+    """Rules of referral, and where the patient goes.
+
+    `vision_limit`: the lowest visual acuity that is not referred. `centre_phone`: telephone. `within_days`: days after
+    the visit within which a referral that is not urgent is to be seen. `where`: place to go, by language.
+    """
 
     vision_limit: Vision
     centre_phone: str | None = Field(default=None, max_length=40)
+    within_days: int = Field(default=30, ge=1, le=365)
+    where: Texts = Field(default={})
+
+
+class LetterTexts(Table):
+    """Texts of slips and letters: name and address of the programme, to whom letters are addressed, a note by language.
+
+    Without a name slips and letters have no heading of the programme.
+    """
+
+    name: str | None = Field(default=None, min_length=1, max_length=80)
+    address: str | None = Field(default=None, min_length=1, max_length=200)
+    to: str | None = Field(default=None, min_length=1, max_length=120)
+    note: Texts = Field(default={})
 
 
 class PatientNumbers(Table):
@@ -88,6 +108,7 @@ class Programme(Table):
     frames: int = Field(default=FRAMES, ge=1, le=FRAMES)
     colours: tuple[OtherColour, ...] = COLOURS
     referral: Referral
+    letter: LetterTexts = LetterTexts()
     numbers: PatientNumbers
     # Not on the wire: the page has no use for them.
     retention: Retention = Field(default=Retention(), exclude=True)

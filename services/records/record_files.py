@@ -60,9 +60,10 @@ class RecordFiles:
             return document
 
     def ids(self, kind: Kind) -> Iterator[str]:
-        """Yield the ids of the records of patients or visits that have a file, sorted."""
-        folder = self._folder / _FOLDERS[kind]
-        if folder.is_dir():
+        """Yield the ids of the patients or visits that have a file, or of the captures that have a folder, sorted."""
+        if kind == "capture":
+            yield from [path.name for path in files_in(self._folder / "captures") if path.is_dir()]
+        elif (folder := self._folder / _FOLDERS[kind]).is_dir():
             yield from [path.stem for path in files_in(folder, "*.json")]
 
     def write(self, documents: Iterable[RecordDocument]) -> None:

@@ -77,6 +77,14 @@ def documents_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[Reco
     return documents
 
 
+def pages_of_keys(session: Session, kind: Kind) -> Iterator[list[str]]:
+    """Yield the readable primary keys of all records of a kind, PAGE_ROWS at a time; rows expire after each page."""
+    keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
+    for start in range(0, len(keys), PAGE_ROWS):
+        yield keys[start : start + PAGE_ROWS]
+        session.expire_all()
+
+
 def rows_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[RecordRow]:
     """Return the rows of these records, captures with their file rows; unknown keys are omitted."""
     query = select(schema.RECORD_TABLES[kind]).where(schema.RECORD_KEYS[kind].in_(keys))

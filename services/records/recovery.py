@@ -31,7 +31,6 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.errors import StoreError
-from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records import record_rows, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
@@ -42,9 +41,9 @@ from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles, new_key, note_key
 from services.records.record_rows import Content
 from services.records.record_signing import (
-    PAGE_ROWS,
     contents_of,
     documents_of,
+    pages_of_keys,
     refuse_changed,
     rows_of,
     sign_changed,
@@ -52,7 +51,7 @@ from services.records.record_signing import (
 )
 from services.records.recovery_report import RecoveryReport
 from services.records.removed_captures import MARK, is_large
-from services.records.schema import CaptureRow, RecordRow
+from services.records.schema import CaptureRow, RecordRow, VisitRow
 from services.records.snapshots import move_to_numbered_folder, refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
 
@@ -119,6 +118,9 @@ class Recovery:
         to_write = [*self._reconcile(session, "patient"), *self._reconcile(session, "visit")]
         suspicious = {*self.report.visits, *(record.id for record in to_write if record.kind == "visit")}
         to_write += self._reconcile(session, "capture", suspicious)
+        if self.report.adopted:
+            named = select(CaptureRow.visit).where(CaptureRow.visit.not_in(select(VisitRow.id))).distinct()
+            self.report.lost_visits += [visit for visit in session.scalars(named) if visit is not None]
         record_rows.restore_slots(session)
         for document, as_described in self._restored_visits:
             missing = record_rows.restore_decisions(session, document.content)
@@ -138,9 +140,8 @@ class Recovery:
         """
         to_write = []
         known = set[str]()
-        keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
-        for start in range(0, len(keys), PAGE_ROWS):
-            rows = rows_of(session, kind, keys[start : start + PAGE_ROWS])
+        for page in pages_of_keys(session, kind):
+            rows = rows_of(session, kind, page)
             contents = contents_of(session, kind, rows)
             for row in rows:
                 rows_document = _document_in_rows(kind, row, contents[schema.record_key(row)])
@@ -149,8 +150,7 @@ class Recovery:
                 if _is_settled(kind, row, rows_document, of_visits):
                     continue
                 to_write += self._compare(session, row, rows_document, self._file(kind, id))
-            session.expire_all()
-        for id in self._ids_of_files(kind):
+        for id in self._files.ids(kind):
             if id not in known and (document := self._file(kind, id)) is not None:
                 self._restore(session, document, known=False)
         return to_write
@@ -238,12 +238,6 @@ class Recovery:
             log.error("%s", error)
             return None
 
-    def _ids_of_files(self, kind: Kind) -> list[str]:
-        if kind != "capture":
-            return list(self._files.ids(kind))
-        folder = self._folder / "captures"
-        return [path.name for path in files_in(folder) if path.is_dir()]
-
     def _log(self) -> None:
         report = self.report
         if report.rebuilt_because is not None:
@@ -255,6 +249,7 @@ class Recovery:
             ("patients were restored from their files", report.patients),
             ("records had two states, one of which is now in conflicts/", report.conflicts),
             ("chosen captures have no folder any more", report.missing),
+            ("visits of adopted captures are gone", report.lost_visits),
         ):
             if ids:
                 log.warning("%d %s: %s", len(ids), what, ", ".join(ids[:20]))
@@ -264,10 +259,8 @@ def _documents(session: Session) -> Iterator[RecordDocument]:
     """Yield the records of all readable rows."""
     kinds: tuple[Kind, ...] = ("patient", "visit", "capture")
     for kind in kinds:
-        keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
-        for start in range(0, len(keys), PAGE_ROWS):
-            yield from documents_of(session, kind, keys[start : start + PAGE_ROWS])
-            session.expire_all()
+        for page in pages_of_keys(session, kind):
+            yield from documents_of(session, kind, page)
 
 
 def _delete_misnamed(session: Session, document: RecordDocument) -> None:

@@ -5,7 +5,7 @@ import math
 import os
 import stat
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -360,11 +360,44 @@ RECORD_TABLES: dict[str, type[RecordRow]] = {
     "capture": CaptureRow,
 }
 RECORD_KEYS = {"patient": PatientRow.patient_id, "visit": VisitRow.id, "capture": CaptureRow.id}
+SIGNED = {  # columns of the values of a record
+    "patient": "patient_id, made_at, identity",
+    "visit": "patient, day, begun_at, finished_at, outcome, sent, request",
+    "capture": "eye, taken_at, simulated, calibration_id, report, request",
+}
+RECORD_OF_PART = {  # table of values of a record: the record, column with its key
+    "files": ("capture", "capture_id"),
+    "answers": ("visit", "visit"),
+    "changes": ("visit", "visit"),
+    "slot_decisions": ("visit", "visit"),
+    "uploads": ("visit", "visit"),
+}
 
 
 def record_key(row: RecordRow) -> str:
     """Return the primary key of the row of a record: the id of the patient, the visit or the capture."""
     return row.patient_id if isinstance(row, PatientRow) else row.id
+
+
+def _signing_triggers() -> Iterator[str]:
+    """Yield the SQL of the triggers that make the digest of a record null when one of its values is changed.
+
+    The revision of a visit shows that a capture of it was corrected.
+    """
+    for kind, table in RECORD_TABLES.items():
+        name = table.__tablename__
+        yield _trigger(f"{name}_changed", f"UPDATE OF {SIGNED[kind]} ON {name}", kind, f"NEW.{RECORD_KEYS[kind].key}")
+    yield _trigger("captures_of_visit_changed", "UPDATE OF eye, report ON captures", "visit", "NEW.visit")
+    for part, (kind, column) in RECORD_OF_PART.items():
+        for change, row in (("INSERT", "NEW"), ("UPDATE", "NEW"), ("DELETE", "OLD")):
+            sent_only = f" WHEN {row}.sent_at IS NOT NULL" if part == "uploads" else ""
+            yield _trigger(f"{part}_{change.lower()}", f"{change} ON {part}{sent_only}", kind, f"{row}.{column}")
+
+
+def _trigger(name: str, change: str, kind: str, key: str) -> str:
+    table = RECORD_TABLES[kind].__tablename__
+    body = f"UPDATE {table} SET record_sha256 = NULL WHERE {RECORD_KEYS[kind].key} = {key}"
+    return f"CREATE TRIGGER {name} AFTER {change} BEGIN {body}; END"
 
 
 def open_engine(path: Path, key: bytes | None = None) -> Engine:
@@ -467,10 +500,10 @@ def lock_briefly(engine: Engine) -> None:
 def migrate(engine: Engine, before: Callable[[str], None], migrations: Path = MIGRATIONS) -> None:
     """Migrate the tables to the schema of this release in one transaction; leave tables of a newer schema unchanged.
 
-    A newer schema is present after a rollback of an update. Releases only add to the schema (README), so this release
-    works with a newer one. `before` is called with the present revision before the migration of existing tables; an
-    exception of `before` cancels the migration. `migrations`: folder of the migrations. StoreError for tables of a
-    version before the first release.
+    Without tables, create those of this release. A newer schema is present after a rollback of an update. Releases only
+    add to the schema (README), so this release works with a newer one. `before` is called with the present revision
+    before the migration of existing tables; an exception of `before` cancels the migration. `migrations`: folder of the
+    migrations. StoreError for tables of a version before the first release.
     """
     config = Config()
     config.set_main_option("script_location", str(migrations).replace("%", "%%"))
@@ -486,7 +519,13 @@ def migrate(engine: Engine, before: Callable[[str], None], migrations: Path = MI
         before(version)
     with for_writing(engine).begin() as connection:
         config.attributes["connection"] = connection
-        command.upgrade(config, "head")
+        if present:
+            command.upgrade(config, "head")
+        else:
+            Base.metadata.create_all(connection, checkfirst=False)
+            for trigger in _signing_triggers():
+                connection.exec_driver_sql(trigger)
+            command.stamp(config, "head")
         tables = [tuple(row) for row in connection.exec_driver_sql(SCHEMA_TEXT)]
         connection.exec_driver_sql(f"PRAGMA user_version = {schema_checksum(tables)}")
 

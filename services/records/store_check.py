@@ -9,14 +9,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from device.user_files import files_in
-from services.errors import RecordErased, RecordNotFound, StoreDamaged
-from services.records import blobs, record_signing, row_validation, schema
+from services.errors import RecordErased, StoreDamaged
+from services.records import blobs, record_signing, schema
 from services.records.dose_ledger_log import DoseLedgerLog
-from services.records.earlier_stores import refuse_earlier_store
+from services.records.earlier_stores import require_store
 from services.records.patient_keys import DEVICE, PatientKeys, ids_in_files
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles
@@ -50,9 +48,7 @@ def check_store(folder: Path, progress: Progress, key: bytes | None = None) -> l
 
     RecordNotFound if the folder holds no store; StoreError if the disk refuses, or for an earlier store.
     """
-    if not (folder / "captures").is_dir():
-        raise RecordNotFound(f"{folder} holds no captures", "Give the folder of the captures with --data.")
-    refuse_earlier_store(folder / schema.DATABASE)
+    require_store(folder / schema.DATABASE)
     with storage_errors():
         progress("reading the database")
         database = _checked_database(folder)
@@ -123,7 +119,7 @@ def _checked_records(
             result.whole += 1
         else:
             result.healable.append(id)
-    for id in _ids_of_files(folder, kind):
+    for id in files.ids(kind):
         if id not in known:
             in_file = _in_file(files, kind, id)
             (result.damaged if in_file is None else result.healable).append(id)
@@ -137,13 +133,10 @@ def _records_in_rows(folder: Path, kind: Kind) -> Iterator[tuple[str, RecordDocu
     engine = schema.open_engine(folder / schema.DATABASE)
     try:
         with Session(engine) as session:
-            keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
-            for start in range(0, len(keys), record_signing.PAGE_ROWS):
-                page = keys[start : start + record_signing.PAGE_ROWS]
+            for page in record_signing.pages_of_keys(session, kind):
                 whole = {record.id: record for record in record_signing.documents_of(session, kind, page)}
                 for row in record_signing.rows_of(session, kind, page):
                     yield schema.record_key(row), whole.get(schema.record_key(row))
-                session.expire_all()
     finally:
         engine.dispose()
 
@@ -153,12 +146,6 @@ def _in_file(files: RecordFiles, kind: Kind, id: str) -> RecordDocument | None:
         return files.read(kind, id)
     except StoreDamaged:
         return None
-
-
-def _ids_of_files(folder: Path, kind: Kind) -> list[str]:
-    if kind != "capture":
-        return list(RecordFiles(folder).ids(kind))
-    return [path.name for path in files_in(folder / "captures") if path.is_dir()]
 
 
 def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocument], key: bytes | None) -> Checked:

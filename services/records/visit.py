@@ -5,18 +5,28 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal, cast
 
-from device.values import ChannelUse, Eye
+from pydantic import BaseModel, ConfigDict
+
+from device.values import EYES, ChannelUse, Eye
 from services.records.capture import NO_METHOD, StoredVerdict
 from services.records.json_values import FormValue
-from services.records.programme import VISIONS, Programme, Vision
+from services.records.programme import VISIONS, Programme, Slot, Vision
 
 GREEN_ONLY = "colour.none"  # no other colour was asked for, or the head has none
-EYE_WORDS = {"OD": "right", "OS": "left"}
-URGENT_COMPLAINTS = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
+URGENT_COMPLAINTS = frozenset({"sudden_loss", "pain"})
 ReopenReason = Literal["answer", "picture", "mistake"]  # a wrong answer, a missing picture, finished by mistake
 # consent withdrawn, erasure asked for, retention over, begun by mistake
 EraseReason = Literal["withdrawn", "requested", "retention", "mistake"]
 OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "declined", "send"]
+Urgency = Literal["today", "soon", "none"]
+URGENCIES: Mapping[OutcomeCode, Urgency] = {
+    "refer_today": "today",
+    "refer_vision": "soon",
+    "refer_picture": "soon",
+    "declined": "none",
+    "send": "none",
+}
+ReasonCode = Literal["complaint", "vision", "declined", "not_possible", "not_taken", "quality"]
 
 
 @dataclass(frozen=True)
@@ -69,12 +79,30 @@ class SlotState:
         return max(enumerate(self.captures), key=lambda pair: (pair[1].is_good, pair[0]), default=(0, None))[1]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of a visit: a code for programs, and the same as one sentence for the health worker."""
+class OutcomeReason(BaseModel):
+    """One reason of an outcome: a code with its values, which the page and the letter translate.
+
+    `complaint`: its name is `value`. `vision`: `value` of `eye` is below the limit. `declined`: no consent to pictures.
+    `not_possible`, `not_taken`, `quality`: picture of `field` of `eye`; `value` is why it was not possible, or the code
+    of its verdict. `not_taken` without a field: no picture of that eye.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    code: ReasonCode
+    eye: Eye | None = None
+    field: str | None = None
+    value: str | None = None
+
+
+class Outcome(BaseModel):
+    """Outcome of a visit: code of its headline, urgency of the referral, all reasons, most urgent first."""
+
+    model_config = ConfigDict(frozen=True)
 
     code: OutcomeCode
-    sentence: str
+    urgency: Urgency
+    reasons: tuple[OutcomeReason, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -138,51 +166,68 @@ def decision_after(slot: SlotState, new: SlotCapture) -> SlotDecision | None:
 
 
 def decide_outcome(programme: Programme, fields: Mapping[str, FormValue], slots: Mapping[str, SlotState]) -> Outcome:
-    """Return the outcome of a visit by the rules of the programme: the first that applies, most urgent first.
+    """Return the outcome of a visit by the rules of the programme: all reasons, and the most urgent as headline.
 
     Order: urgent complaint (`refer_today`), vision below the programme's limit (`refer_vision`), no consent to pictures
-    (`declined`, no referral), an eye without a picture or with a required one not possible (`refer_picture`),
-    else `send`. The sentence names no disease.
+    or every picture refused (`declined`, no referral), an eye without a picture or with a required one not possible
+    (`refer_picture`), else `send`. A picture that the patient refused is a reason, and no referral.
     """
-    complaints = fields.get("complaints")
-    named = complaints if isinstance(complaints, list) else ()
-    urgent = [words for complaint, words in URGENT_COMPLAINTS.items() if complaint in named]
-    if urgent:
-        return Outcome("refer_today", f"See the doctor today: {' and '.join(urgent)}.")
-    limit = programme.referral.vision_limit
-    low_vision = [eye for eye in EYE_WORDS if _is_below(fields.get(f"vision_{eye.lower()}"), limit)]
-    if low_vision:
-        return Outcome("refer_vision", f"Refer: vision of {_eyes(low_vision)} below {limit}.")
-    if fields.get("consent") == "declined":
-        taken = any(slot.captures for slot in slots.values())
-        kept = " to more. Those taken before are kept." if taken else " to pictures. None were taken."
-        return Outcome("declined", f"The patient did not agree{kept}")
-    if missing_phrases := _missing_pictures(programme, slots):
-        return Outcome("refer_picture", f"Refer: {'; '.join(missing_phrases)}.")
-    empty = sum(slot.required and slots[slot.id].state == "empty" for slot in programme.slots)
-    missing = f", {empty} not taken" if empty else ""
-    return Outcome("send", f"The pictures are kept{missing}. They are for an eye specialist.")
-
-
-def _is_below(vision: FormValue, limit: Vision) -> bool:
-    return vision is not None and VISIONS.index(cast(Vision, vision)) > VISIONS.index(limit)
-
-
-def _missing_pictures(programme: Programme, slots: Mapping[str, SlotState]) -> list[str]:
-    """Return a phrase for each group of eyes without any picture, or with a required picture that was not possible.
-
-    Not possible: the slot has the state `not_possible`. A required slot that is only empty adds no phrase if the eye
-    has another picture.
-    """
-    failed = {slot.eye for slot in programme.slots if slot.required and slots[slot.id].state == "not_possible"}
-    seen = {slot.eye for slot in programme.slots if slots[slot.id].state == "taken"}
-    phrases: tuple[tuple[str, list[Eye]], ...] = (
-        ("picture of {} not possible", [eye for eye in programme.eyes if eye in failed and eye not in seen]),
-        ("not every picture of {} possible", [eye for eye in programme.eyes if eye in failed and eye in seen]),
-        ("picture of {} not taken", [eye for eye in programme.eyes if eye not in failed and eye not in seen]),
+    reasons = (
+        *_complaints(fields),
+        *_low_visions(fields, programme.referral.vision_limit),
+        *_pictures(programme, slots, has_consent=fields.get("consent") != "declined"),
     )
-    return [words.format(_eyes(eyes)) for words, eyes in phrases if eyes]
+    code = _headline(programme, reasons, any(slot.chosen for slot in slots.values()))
+    return Outcome(code=code, urgency=URGENCIES[code], reasons=reasons)
 
 
-def _eyes(eyes: Sequence[str]) -> str:
-    return f"the {EYE_WORDS[eyes[0]]} eye" if len(eyes) == 1 else "both eyes"
+def _complaints(fields: Mapping[str, FormValue]) -> list[OutcomeReason]:
+    complaints = fields.get("complaints")
+    named = [name for name in complaints if name != "none"] if isinstance(complaints, list) else []
+    named.sort(key=lambda name: name not in URGENT_COMPLAINTS)
+    return [OutcomeReason(code="complaint", value=name) for name in named]
+
+
+def _low_visions(fields: Mapping[str, FormValue], limit: Vision) -> list[OutcomeReason]:
+    seen = [(eye, cast(Vision | None, fields.get(f"vision_{eye.lower()}"))) for eye in EYES]
+    low = [(eye, vision) for eye, vision in seen if vision is not None and VISIONS.index(vision) > VISIONS.index(limit)]
+    return [OutcomeReason(code="vision", eye=eye, value=vision) for eye, vision in low]
+
+
+def _pictures(programme: Programme, slots: Mapping[str, SlotState], has_consent: bool) -> list[OutcomeReason]:
+    """Return the reasons of pictures; without consent, of those which are not taken only that."""
+    reasons = [] if has_consent else [OutcomeReason(code="declined")]
+    states = {slot: slots[slot.id].state for slot in programme.slots}
+    tried = {slot.eye for slot, state in states.items() if state == "taken" or (state != "empty" and slot.required)}
+    for slot in programme.slots:
+        if states[slot] != "empty":
+            reasons += _of_slot(slot, slots[slot.id])
+        elif has_consent and slot.required:
+            untaken = OutcomeReason(code="not_taken", eye=slot.eye, field=slot.field if slot.eye in tried else None)
+            reasons += [] if untaken in reasons else [untaken]
+    return reasons
+
+
+def _of_slot(slot: Slot, state: SlotState) -> list[OutcomeReason]:
+    decision, chosen = state.decision, state.chosen
+    if decision is not None and decision.reason is not None:
+        return [OutcomeReason(code="not_possible", eye=slot.eye, field=slot.field, value=decision.reason)]
+    if chosen is None or chosen.verdict is None or chosen.is_good:
+        return []
+    return [OutcomeReason(code="quality", eye=slot.eye, field=slot.field, value=chosen.verdict.code)]
+
+
+def _headline(programme: Programme, reasons: Sequence[OutcomeReason], has_picture: bool) -> OutcomeCode:
+    codes = {reason.code for reason in reasons}
+    required = {(slot.eye, slot.field) for slot in programme.slots if slot.required}
+    failed = [reason for reason in reasons if reason.code == "not_possible" and (reason.eye, reason.field) in required]
+    if any(reason.value in URGENT_COMPLAINTS for reason in reasons if reason.code == "complaint"):
+        return "refer_today"
+    if "vision" in codes:
+        return "refer_vision"
+    if "declined" in codes:
+        return "declined"
+    has_unseen_eye = any(reason.code == "not_taken" and reason.field is None for reason in reasons)
+    if has_unseen_eye or any(reason.value != "refused" for reason in failed):
+        return "refer_picture"
+    return "declined" if failed and not has_picture else "send"

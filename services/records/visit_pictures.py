@@ -109,9 +109,9 @@ class VisitPictures:
             with storage_errors(), Session(self._engine) as session:
                 consent = visit_queries.consent(session, id)
             if consent == "declined":
-                raise ConsentDeclined("this person did not agree to pictures")
+                raise ConsentDeclined("this patient did not agree to pictures")
             if consent != "agreed":
-                raise ConsentMissing("this person has not agreed to pictures yet")
+                raise ConsentMissing("this patient has not agreed to pictures yet")
 
         return permit
 
@@ -192,7 +192,7 @@ class VisitPictures:
             if capture is not None:
                 shot = laterality_correction.slot_row_of(session, capture)
                 if (shot.visit, shot.slot) != (id, slot):
-                    raise RecordNotFound(f"this is not a picture of {slot} of this person")
+                    raise RecordNotFound(f"this is not a picture of {slot} of this patient")
             visit_rows.decide(session, id, slot, SlotDecision(capture))
             return id
 

@@ -9,7 +9,6 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from datetime import date
-from typing import get_args
 
 from pydantic import TypeAdapter
 from sqlalchemy import case, func, select
@@ -38,7 +37,7 @@ from services.records.schema import (
     VisitRow,
     json_extract_or_null,
 )
-from services.records.visit import Outcome, OutcomeCode, SlotCapture, SlotDecision, SlotState, Visit, no_colour_of
+from services.records.visit import Outcome, SlotCapture, SlotDecision, SlotState, Visit, no_colour_of
 from services.records.visit_document import VisitChange
 
 PAGE_ROWS = 500  # visits per query where all visits are read
@@ -51,7 +50,7 @@ def visit_row(session: Session, id: str) -> VisitRow:
     """Return the row of a visit; RecordNotFound if unknown, StoreDamaged if its id differs from the requested one."""
     found = session.get(VisitRow, id) if _ID.fullmatch(id) else None
     if found is None:
-        raise RecordNotFound("this visit is not kept here", "Choose the person from the list.")
+        raise RecordNotFound("this visit is not saved here", "Choose the patient from the list.")
     if found.id != id:  # the index still holds the id, the row does not
         raise StoreDamaged(f"the entry of the visit {id!r} has another name", REMEDY)
     return found
@@ -170,7 +169,7 @@ def read_visits(session: Session, programme: Programme, rows: Sequence[VisitRow]
                 answers,
                 slots,
                 finished_at,
-                None if row.outcome is None else _outcome(row.outcome),
+                None if row.outcome is None else Outcome.model_validate(row_validation.parsed_json(row.outcome)),
             )
 
     return without_damaged(known, visit)
@@ -208,14 +207,6 @@ def _checked_row(row: VisitRow) -> VisitRow:
 
 def _day(value: object) -> str:
     return date.fromisoformat(row_validation.text(value)).isoformat()
-
-
-def _outcome(value: object) -> Outcome:
-    stored = row_validation.parsed_json(value)
-    if not isinstance(stored, dict):
-        raise ValueError("an outcome that is no object")
-    code: OutcomeCode = row_validation.one_of(stored["code"], *get_args(OutcomeCode))
-    return Outcome(code, row_validation.text(stored["sentence"]))
 
 
 def _answers(session: Session, ids: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -62,7 +62,7 @@ def finish(session: Session, programme: Programme, row: VisitRow, at: str, user:
     visit = visit_queries.read_visit(session, programme, row)
     ending = decide_outcome(programme, visit.fields, visit.slots)
     record_change(session, row.id, "outcome", outcome_code(row), ending.code, at, user)
-    row.outcome = json.dumps({"code": ending.code, "sentence": ending.sentence})
+    row.outcome = json.dumps(ending.model_dump())
     row.finished_at = at
 
 

@@ -41,16 +41,11 @@ ProgressCallback = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DatasetFrontierRequest:
-    """Options of `diffuscope frontier --data`, as of `FrontierRequest`; `limit` None measures all pairs."""
+    """Options of `diffuscope frontier --data`: the data set, and the others; `limit` None measures all pairs."""
 
     dataset: Dataset
     limit: int | None
-    json: Path
-    plot: Path
-    budget_s: float
-    repeats: int
-    plans: Path | None
-    methods: tuple[str, ...] = ()
+    options: FrontierRequest
 
 
 @dataclass(frozen=True)
@@ -88,16 +83,7 @@ def dataset_request(request: FrontierRequest, folder: Path, limit: int | None) -
     for place in (request.json, request.plot):
         require_writable(place)
     Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
-    return DatasetFrontierRequest(
-        open_dataset(folder, request.psf),
-        limit,
-        request.json,
-        request.plot,
-        request.budget_s,
-        request.repeats,
-        request.plans,
-        request.methods,
-    )
+    return DatasetFrontierRequest(open_dataset(folder, request.psf), limit, request)
 
 
 def frontier_of_dataset(
@@ -107,18 +93,18 @@ def frontier_of_dataset(
 
     A pair that fails is in `left_out`; the others go on. FrameError if none is left. StoreError for an unwritable file.
     """
-    dataset = selected(request.dataset, request.limit)
+    dataset, options = selected(request.dataset, request.limit), request.options
     frontiers = []
     scores = []
     left_out = []
-    planner = Planner(request.plans)
-    methods = selected_methods(request.methods)
+    planner = Planner(options.plans)
+    methods = selected_methods(options.methods)
     for k, entry in enumerate(dataset.entries, 1):
         progress(f"{k} of {len(dataset)}: {entry.name}")
         try:
             measured = _Measured.of(dataset, entry, planner)
             fft = FftTime.measured(planner, measured.pair.shape, SystemClock())
-            found = measure_frontier(measured.case, request.plans, request.budget_s, request.repeats, progress, methods)
+            found = measure_frontier(measured.case, options.plans, options.budget_s, options.repeats, progress, methods)
         except DiffuscopeError as error:
             left_out.append(left(entry.name, None, error, progress))
             continue
@@ -135,8 +121,8 @@ def frontier_of_dataset(
             f"no pair of {dataset.folder} can be measured: {'; '.join(map(str, left_out))}",
             "Give pairs with truths; `diffuscope data FOLDER --check` names what is missing.",
         )
-    result = _joined(dataset.layout.title, request.budget_s, frontiers, scores, left_out)
-    _write(request, result, draw_frontier(mean_frontier(result), methods))
+    result = _joined(dataset.layout.title, options.budget_s, frontiers, scores, left_out)
+    _write(options, result, draw_frontier(mean_frontier(result), methods))
     return result
 
 
@@ -255,7 +241,7 @@ def dataset_table(found: DatasetFrontier) -> str:
     return f"{table(found.rows)}\n{CHOICE}: what the instrument chooses within {found.budget_s:g} s"
 
 
-def _write(request: DatasetFrontierRequest, result: DatasetFrontier, picture: str) -> None:
+def _write(options: FrontierRequest, result: DatasetFrontier, picture: str) -> None:
     text = json.dumps(asdict(result), indent=1) + "\n"
-    write_or_raise(request.json, lambda: request.json.write_text(text, encoding="utf-8"))
-    write_or_raise(request.plot, lambda: request.plot.write_text(picture, encoding="utf-8"))
+    write_or_raise(options.json, lambda: options.json.write_text(text, encoding="utf-8"))
+    write_or_raise(options.plot, lambda: options.plot.write_text(picture, encoding="utf-8"))

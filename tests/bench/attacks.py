@@ -70,8 +70,7 @@ class Instrument:
         words = ["run", "--head", "hardware/heads/sim.toml", "--port", str(self.port)]
         if self._is_open:
             self._write_identity()
-            files = (str(self._data / "server.pem"), "--certificate-key", str(self._data / "server.pem"))
-            words += ["--host", "0.0.0.0", "--certificate", *files]
+            words += ["--host", "0.0.0.0", "--tls", str(self._data)]
         command = [str(self._tree / ".venv/bin/diffuscope"), *words, "--data", str(self._data)]
         with self._log.open("wb") as log:
             process = subprocess.Popen(command, cwd=self._tree, stdout=log, stderr=log, preexec_fn=self._limit_files)

@@ -9,7 +9,6 @@ import asyncio
 import json
 import re
 import secrets
-import subprocess
 import sys
 import tempfile
 import threading
@@ -24,9 +23,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.bench.timing import head, row
 from tests.browser.conftest import CHROMIUM, Server, free_port
+from tests.network_namespace import HERE, IN_SPACE, OURS, THEIRS, namespace, sh
 
-SPACE, HERE, THERE = "diffuscope-tablet", "10.77.0.1", "10.77.0.2"
-OURS, THEIRS = "dsc-here", "dsc-there"
 WATCHED_S = 20.0
 FIRST_USES = 9
 LOADED = "performance.getEntriesByType('resource').map(({ startTime, transferSize }) => [startTime, transferSize])"
@@ -48,35 +46,11 @@ CanvasRenderingContext2D.prototype.drawImage = function (...words) {
 """
 
 
-def sh(*words: str) -> None:
-    subprocess.run(words, check=True, capture_output=True)
-
-
-@contextmanager
-def namespace() -> Iterator[None]:
-    """Create a second host on this machine, with one link to it."""
-    subprocess.run(["ip", "netns", "del", SPACE], check=False, capture_output=True)
-    sh("ip", "netns", "add", SPACE)
-    try:
-        sh("ip", "link", "add", OURS, "type", "veth", "peer", "name", THEIRS, "netns", SPACE)
-        sh("ip", "addr", "add", f"{HERE}/24", "dev", OURS)
-        sh("ip", "link", "set", OURS, "up")
-        for words in (
-            ["addr", "add", f"{THERE}/24", "dev", THEIRS],
-            ["link", "set", THEIRS, "up"],
-            ["link", "set", "lo", "up"],
-        ):
-            sh("ip", "-n", SPACE, *words)
-        yield
-    finally:
-        subprocess.run(["ip", "netns", "del", SPACE], check=False, capture_output=True)
-
-
 def throttle(mbit_per_s: int) -> None:
     """Limit both directions by a queue of 400 ms."""
     queue = ["root", "tbf", "rate", f"{mbit_per_s}mbit", "burst", "16kb", "latency", "400ms"]
     sh("tc", "qdisc", "replace", "dev", OURS, *queue)
-    sh("ip", "netns", "exec", SPACE, "tc", "qdisc", "replace", "dev", THEIRS, *queue)
+    sh(*IN_SPACE, "tc", "qdisc", "replace", "dev", THEIRS, *queue)
 
 
 class Relay:
@@ -110,7 +84,7 @@ class Relay:
 def tablet(folder: Path) -> Iterator[Browser]:
     """Yield a Chromium at the other end of the link."""
     wrapper = folder / "chromium"
-    wrapper.write_text(f'#!/bin/sh\nexec ip netns exec {SPACE} {CHROMIUM} "$@"\n')
+    wrapper.write_text(f'#!/bin/sh\nexec {" ".join(IN_SPACE)} {CHROMIUM} "$@"\n')
     wrapper.chmod(0o755)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=str(wrapper), args=["--no-sandbox"])

@@ -62,7 +62,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
     stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     after_debounce(page).keyboard.press("n")
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Optic disc")
     with real.poor_light("saturated"):
         for _ in range(2):
             real.press(visit_of(page), "R-nerve")
@@ -70,7 +70,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
         page.wait_for_selector("[data-phase=kept] [data-verdict=again]")
         strike(page, "#not-possible")
     strike(page, "[data-reason=still]")
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Centre")
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Macula")
     strike(page, SHUTTER)
     stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
@@ -98,7 +98,7 @@ def test_disabled_letter_keys_leave_shutter_keys_active(open_page: Open, real: R
     expect(page.locator(".page")).to_have_attribute("data-screen", "picture")
     expect(page.locator("dialog[open]")).to_have_count(0)
     strike(page, "#next")  # each letter key has an equivalent button
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
 
 
 @pytest.mark.parametrize("size", MAGNIFIED.values(), ids=MAGNIFIED.keys())

@@ -35,16 +35,16 @@ ASSERTIVE = {"link.lost", "light.fault", "light.limit", "light.day", "heat.hot",
 BLOCKING = {
     "camera.missing": "No camera",
     "light.fault": "Light fault",
-    "light.day": "No more light",
-    "cal.missing": "Needs set-up",
-    "cal.mismatch": "Needs set-up",
+    "light.day": "Light limit reached",
+    "cal.missing": "Not calibrated",
+    "cal.mismatch": "Not calibrated",
     "store.full": "No space",
     "batt.empty": "Battery empty",
     "heat.hot": r"Too hot – (5:00|4:\d\d)",
-    "link.other": "Other screen",
-    "consent.missing": "First ask: may we?",
+    "link.other": "Other tablet",
+    "consent.missing": "Ask the patient first",
     "consent.declined": "Did not agree",
-    "light.limit": r"Rest this eye – \d+:\d\d",  # the last: its cause is hours old
+    "light.limit": r"Light limit: wait – \d+:\d\d",  # the last: its cause is hours old
 }
 ADVISORY = [
     "camera.stalled",
@@ -72,7 +72,7 @@ def test_alert_table_matches_specification() -> None:
     assert states == SPECIFIED
     for words in [words for key, words in english.items() if key.startswith(("state.", "aim."))]:
         assert max(len(line.split()) for line in re.split(r"(?<=[.?…])\s", words)) <= 12
-    forbidden = r"normal|healthy|disease|retinopathy|glaucoma|cataract|macula"
+    forbidden = r"normal|healthy|disease|retinopathy|glaucoma|cataract|maculopathy"
     assert not re.findall(forbidden, " ".join(english.values()), re.IGNORECASE)
 
 
@@ -148,8 +148,8 @@ def test_light_limit_offers_other_eye(open_page: Open, real: Real) -> None:
     visit = real.begin_visit(consent="agreed")["id"]
     CAUSES["light.limit"](real, visit)
     page = after_debounce(open_page(f"{real.url}/#/visit/{visit}/aim/R-centre"))
-    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Rest it \d+ minutes\."))
-    expect(page.locator(SHUTTER)).to_contain_text(re.compile(r"Rest this eye – \d+:\d\d"))
+    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Wait \d+ minutes with this eye\."))
+    expect(page.locator(SHUTTER)).to_contain_text(re.compile(r"Light limit: wait – \d+:\d\d"))
     page.locator("[data-do=otherEye]").tap()
     expect(page.locator(SHUTTER)).to_contain_text("Take picture")
     expect(page.locator(SHUTTER)).to_contain_text("Left eye")
@@ -167,7 +167,7 @@ def test_poor_verdict_shows_cause_and_action(open_page: Open, real: Real) -> Non
         expect(page.locator(".card")).to_contain_text(english[f"state.shot.{cause}"])
         assert (page.locator("[data-do=timer]").count() == 1) == (cause == "pupil")
         page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
-        expect(page.locator(".prompt")).to_have_text("Right eye · Centre Final picture, but not good enough")
+        expect(page.locator(".prompt")).to_have_text("Right eye · Macula Final picture, but not good enough")
         expect(page.locator(".prompt")).to_have_attribute("data-tone", "plain")  # no green tick over "Take again"
     page.locator("[data-do=timer]").tap()
     expect(page.locator(".card .clock")).to_have_text(re.compile(r"1:00|0:5\d"))
@@ -177,16 +177,16 @@ def test_failed_reconstruction_is_reported_and_frame_kept(open_page: Open, real:
     page = aiming(open_page, real)
     real.event_bus.on_press = lambda: real.rig.world.faults.add("camera.mode")
     page.locator(SHUTTER).tap()
-    expect(page.locator(".card")).to_contain_text("The picture could not be made. The shot is kept.")
+    expect(page.locator(".card")).to_contain_text("The picture could not be processed. Its raw frames are saved.")
     expect(page.locator("#keep")).to_be_visible()
 
 
 def test_power_loss_alert_names_slot_and_links_to_it(open_page: Open, standing_alerts: StandingAlerts) -> None:
     page = open_page(standing_alerts.instrument("power.lost").url)
     notice = page.locator("[data-code='power.lost']")
-    expect(notice).to_contain_text("Power went off during a picture. Left eye, Nerve: please take again.")
+    expect(notice).to_contain_text("Power went off during a picture. Left eye, Optic disc: please take again.")
     notice.get_by_role("button", name="Take it now").tap()
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Optic disc")
 
 
 def test_power_loss_alert_without_visits(
@@ -256,4 +256,4 @@ def test_language_is_loaded_and_stored(open_page: Open, real: Real) -> None:
     page.reload()
     expect(page.locator("#new")).to_have_text(re.compile("புதிய நபர்"))
     page.get_by_role("button", name="English").tap()
-    expect(page.locator("#new")).to_have_text(re.compile("New person"))
+    expect(page.locator("#new")).to_have_text(re.compile("New patient"))

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.browser
 
 
 HINTS = {
-    "noeye": ("No eye seen", lambda real: real.rig.world.faults.add("eye.closed")),
+    "noeye": ("No eye found", lambda real: real.rig.world.faults.add("eye.closed")),
     "back": ("Move back a little", lambda real: (real.rig.world.faults.clear(), real.show("pupil"))),
     "ready": ("Ready.", lambda real: real.show(None)),
 }

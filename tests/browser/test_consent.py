@@ -23,8 +23,8 @@ pytestmark = pytest.mark.browser
 
 STAGE = "eye-live"
 WORDS = {
-    "declined": ("This person did not agree. Take no pictures.", "Did not agree"),
-    None: ("First ask: may we take pictures? Then choose the answer.", "First ask: may we?"),
+    "declined": ("This patient did not agree. Take no pictures.", "Did not agree"),
+    None: ("Ask the patient first. Then choose the answer.", "Ask the patient first"),
 }
 
 
@@ -115,7 +115,7 @@ def test_test_picture_is_not_shown_in_visit(open_page: Open, real: Real) -> None
     visit = real.begin_visit()["id"]
     set_consent(real, visit, "agreed")
     page = open_page(f"{real.url}/#/visit/{visit}/picture/R-centre/{made['id']}")
-    expect(page.locator(".state-bar")).to_contain_text("This is a test picture. It belongs to no person.")
+    expect(page.locator(".state-bar")).to_contain_text("This is a test picture. It belongs to no patient.")
     assert page.locator(".stage[data-mark=final]").count() == 0
 
 

@@ -50,7 +50,7 @@ def test_temperature_and_battery_alerts_begin_and_end(open_page: Open, real: Rea
     world.temperature_c = 25.0
     expect_ended(page, "heat.hot")
     world.battery_state = BatteryState(0.12, 3.6)
-    expect_chip(page, "batt.low", "Battery for about 4 more people")
+    expect_chip(page, "batt.low", "Battery for about 4 more patients")
     world.battery_state = BatteryState(0.02, 3.3)
     expect_blocking(page, "batt.empty", "Plug in now. Work is saved.", "Battery empty")
     world.battery_state = BatteryState(0.9, 4.0)
@@ -75,7 +75,7 @@ def test_hardware_fault_alerts_begin_and_end(open_page: Open, real: Real, compla
     expect_ended(page, "camera.stalled")
     real.event_bus.on_press = lambda: faults.add("camera.mode")
     take_picture(page)
-    expect(page.locator(".card")).to_contain_text("The picture could not be made. The shot is kept.")
+    expect(page.locator(".card")).to_contain_text("The picture could not be processed. Its raw frames are saved.")
     faults.clear()
     tap(page, "#again")
     take_picture(page)
@@ -143,7 +143,9 @@ def test_daily_light_limit_is_per_eye(open_page: Open, real: Real, complaints: C
     stop = light.hazard.limits.stop_j_per_cm2
     given = light.ledger.reserve(("OD",), 0.999 * (stop - light.ledger.spent_j_per_cm2("OD")), stop)
     tap(page, SHUTTER)
-    expect_blocking(page, "light.day", "This eye has had today's full light. Do not take more.", "No more light")
+    expect_blocking(
+        page, "light.day", "Today’s light limit is reached. No more pictures of this eye.", "Light limit reached"
+    )
     tap(page, "[data-slot='L-centre']")
     wait_for_preview(page)
     expect(page.locator(SHUTTER)).to_contain_text("Left eye")
@@ -160,7 +162,7 @@ def test_a_page_that_only_shows_pictures_leaves_the_camera(open_page: Open, real
     reader.wait_for_timeout(2500)  # two heartbeats
     assert real.request("GET", "/api/status")["controller"] is None
     aiming(open_page, real)
-    expect(reader.locator(".prompt .title")).to_have_text("Right eye · Centre")
+    expect(reader.locator(".prompt .title")).to_have_text("Right eye · Macula")
     reader.wait_for_timeout(2500)  # the monitor publishes the holder once per second
     expect(reader.locator(".state-bar")).to_have_count(0)
 

@@ -59,7 +59,7 @@ def test_a_message_moves_no_button(open_page: Open, real: Real, size: tuple[int,
             expect(page.locator(f"[data-code='{code}']")).to_be_visible(timeout=15_000)
             assert boxes(page, *buttons) == before, code
             if page.locator("[data-screen=picture]").count():
-                expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")  # no alert in its place
+                expect(page.locator(".prompt .title")).to_have_text("Right eye · Macula")  # no alert in its place
             end()
             expect(page.locator(f"[data-code='{code}']")).to_have_count(0)
 
@@ -79,7 +79,7 @@ def test_a_message_moves_no_button(open_page: Open, real: Real, size: tuple[int,
 def test_result_shows_slot_label_and_one_go_on_text(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real, SIZES["phone"])
     take_picture(page)
-    expect(page.locator(".prompt")).to_contain_text("Right eye · Centre")
+    expect(page.locator(".prompt")).to_contain_text("Right eye · Macula")
     assert page.locator("main").inner_text().count("You can go on") == 1
     expect(page.get_by_role("button", name="Colour")).to_have_attribute("aria-pressed", "true")
 
@@ -113,7 +113,7 @@ def test_find_opens_an_exact_match_only_and_reports_no_match(open_page: Open, re
     expect(page.locator(".people li")).to_have_count(1)
     expect(page.locator("#open-found, .find .primary")).to_have_count(0)  # 0013 is a part of the number only
     page.locator("[data-key='9']").tap()
-    expect(page.get_by_text("No match for 00139.")).to_be_visible()
+    expect(page.get_by_text("No patient with 00139.")).to_be_visible()
     assert pad.bounding_box() == where
     for _ in range(5):
         page.locator("[data-key='erase']").tap()
@@ -182,12 +182,12 @@ def test_compared_pictures_are_labelled(open_page: Open, real: Real) -> None:
     page.goto(f"{real.url}/#/visit/{visit['id']}/compare/{first}/{second}")
     left, right = (page.locator(".two figcaption").nth(index) for index in (0, 1))
     for caption, name in ((left, "picture 1"), (right, "picture 2")):
-        expect(caption).to_contain_text(f"Right eye · Centre, {name}")
+        expect(caption).to_contain_text(f"Right eye · Macula, {name}")
         expect(caption).to_contain_text(":")  # the time of day
     expect(right).to_contain_text("Used")
     expect(left).not_to_contain_text("Used")
-    page.get_by_role("button", name="One over the other").tap()
-    page.get_by_role("button", name="Show Right eye · Centre, picture 2").tap()
+    page.get_by_role("button", name="Switch between the two").tap()
+    page.get_by_role("button", name="Show Right eye · Macula, picture 2").tap()
     expect(right).to_be_visible()
     expect(left).to_be_hidden()
     expect(page.locator("#swap")).to_contain_text("picture 1")

@@ -121,10 +121,10 @@ def test_nor_from_the_button_on_the_handle(open_page: Open, real: Real) -> None:
 def test_going_on_is_announced_and_undone(open_page: Open, real: Real, size: tuple[int, int]) -> None:
     page = aiming(open_page, real, size)
     press_and_go_on(page, "R-nerve")
-    expect(page.locator("[aria-live=polite]")).to_have_text("Right eye, Centre is good. Next: Right eye, Nerve.")
+    expect(page.locator("[aria-live=polite]")).to_have_text("Right eye, Macula is good. Next: Right eye, Optic disc.")
     expect(page.locator(SHUTTER)).to_be_focused()
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
-    expect(page.locator("[data-code='shot.next'] p")).to_have_text("Right eye, Centre is good.")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Optic disc")
+    expect(page.locator("[data-code='shot.next'] p")).to_have_text("Right eye, Macula is good.")
     expect(page.locator("[data-code='shot.next'] .clock")).to_have_count(0)  # no time ends the undo
     assert look_for_faults(page, SHUTTER) == []
     tap(page, "[data-do=showAgain]")
@@ -151,7 +151,7 @@ def test_a_touch_of_the_picture_keeps_it(open_page: Open, real: Real) -> None:
     tap(page, SHUTTER)
     expect(page.locator(".card")).to_contain_text("The next one follows. Touch the picture to stay.")
     page.locator("#picture").tap()
-    expect(page.locator(".card")).to_contain_text("You can go on.")
+    expect(page.locator(".card")).to_contain_text("Sharp and bright enough.")
     expect_to_stay(page)
     tap(page, "#next")
     wait_for_aim(page, "R-nerve")

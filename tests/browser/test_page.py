@@ -78,7 +78,7 @@ def test_readme_shows_the_labels_of_the_page(page: Page, complaints: Complaints)
     press(page, complaints, page.locator(SHUTTER).tap)
     page.wait_for_selector(".stage[data-mark=final]")
     # A busy computer may have no time for the colour.
-    in_colour = ["Colour" if label == "As taken" else label for label in labels(page)]
+    in_colour = ["Colour" if label == "Original" else label for label in labels(page)]
     assert in_colour == shown["result"], "make page-pictures"
 
 
@@ -109,7 +109,7 @@ def test_capture_and_viewer_by_touch(page: Page, complaints: Complaints) -> None
     expect(page.locator("#picture")).to_have_attribute("data-zoom", "3.00")
     page.get_by_role("button", name="Red-free").tap()
     expect(page.get_by_role("button", name="Red-free")).to_have_attribute("aria-pressed", "true")
-    page.get_by_role("button", name="Show all").tap()
+    page.get_by_role("button", name="Whole picture").tap()
     expect(page.locator("#picture")).to_have_attribute("data-zoom", "1.00")
 
     thumbnail = page.locator("[data-slot=L-centre] img")
@@ -214,7 +214,15 @@ def test_every_result_control_is_reachable_by_keyboard(page: Page, complaints: C
         if what[0].startswith("Finish with"):
             break
     names = " | ".join(reached)
-    for name in ("Details", "Red-free", "More contrast", "Zoom in", "Show all", "Take again", "L · Nerve, Left eye"):
+    for name in (
+        "Details",
+        "Red-free",
+        "More contrast",
+        "Zoom in",
+        "Whole picture",
+        "Take again",
+        "L · Optic disc, Left eye",
+    ):
         assert name in names
 
 

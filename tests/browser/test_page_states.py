@@ -53,7 +53,7 @@ def test_final_picture_replaces_quick_look_and_keeps_view(open_page: Open, real:
     page = aiming(open_page, real)
     page.locator(SHUTTER).tap()
     page.wait_for_selector(".stage[data-mark=quick]")
-    expect(page.get_by_role("status")).to_contain_text("Quick look")
+    expect(page.get_by_role("status")).to_contain_text("Preview")
     bar = page.locator("progress").evaluate("bar => bar.value")
     page.get_by_role("button", name="Red-free").tap()
     page.get_by_role("button", name="Zoom in").tap()
@@ -65,7 +65,7 @@ def test_final_picture_replaces_quick_look_and_keeps_view(open_page: Open, real:
     assert page.locator("progress").evaluate("bar => bar.value") > bar
     real.hold = None
     page.wait_for_selector(".stage[data-mark=final]")
-    expect(page.get_by_role("status")).to_contain_text("Final picture, kept")
+    expect(page.get_by_role("status")).to_contain_text("Final picture, saved")
     assert zoom(page) == 2.25
     expect(page.get_by_role("button", name="Red-free")).to_have_attribute("aria-pressed", "true")
 
@@ -149,7 +149,7 @@ def test_second_press_during_capture_is_ignored(open_page: Open, real: Real) -> 
     page = aiming(open_page, real)
     page.locator(SHUTTER).dblclick()
     after_debounce(page).locator(SHUTTER).tap(force=True)
-    expect(page.get_by_role("status")).to_contain_text("still being made")
+    expect(page.get_by_role("status")).to_contain_text("still being processed")
     real.hold = None
     page.wait_for_selector(".stage[data-mark=final]")
     assert real.presses == 1
@@ -162,7 +162,7 @@ def test_a_double_tap_on_next_takes_no_picture(open_page: Open, real: Real) -> N
     assert box is not None
     for _ in range(2):
         page.touchscreen.tap(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     page.wait_for_timeout(300)
     assert real.presses == 1
 
@@ -221,7 +221,7 @@ def test_a_recording_is_marked_on_every_screen(open_page: Open, make_real: MakeR
 def test_old_live_frame_shows_its_age(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     real.rig.block_exposures()
-    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[2-9]\.\d s old$"))
+    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[2-9]\.\d seconds late$"))
     real.clock.gate.set()
     expect(page.locator("eye-live .age")).to_be_hidden()
     page.route("**/api/preview?*", lambda route: None)
@@ -233,10 +233,10 @@ def test_old_live_frame_shows_its_age(open_page: Open, real: Real) -> None:
 def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     real.rig.block_exposures()  # the camera gives no frame; the server answers in time
-    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[4-9]\.\d s old$"))
+    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[4-9]\.\d seconds late$"))
     expect(page.locator("[data-code='link.slow']")).to_have_count(0)
     tap(page, "#not-possible")
-    expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")
+    expect(page.locator(".prompt .title")).to_have_text("Right eye · Macula")
     expect(page.locator("eye-live")).to_have_css("visibility", "hidden")
     with page.expect_response("**/api/preview?*"):  # the server's last frame, which is old
         page.locator("#not-asked").tap()
@@ -296,7 +296,7 @@ def test_theme_is_stored(open_page: Open, real: Real) -> None:
     page = open_page(real.url)
     expect(page.locator("html")).to_have_attribute("data-theme", "dim")
     page.get_by_role("button", name="Menu").tap()
-    page.get_by_role("button", name="Daylight").tap()
+    page.get_by_role("button", name="Light").tap()
     page.get_by_role("button", name="Close").tap()
     page.reload()
     expect(page.locator("html")).to_have_attribute("data-theme", "daylight")

@@ -40,10 +40,10 @@ def test_home_links_to_upload_queue(open_page: Open, queue: Queue) -> None:
     tap(page, "#send")
     items = queue_items(page)
     assert ["does not take it" in item for item in items] == [True, False, False]
-    assert ["tried again by itself" in item for item in items] == [False, True, False]
+    assert ["tried again automatically" in item for item in items] == [False, True, False]
     assert all(re.search(r"\d MB", item) for item in items)
     assert ["1 try" in item for item in items] == [True, True, False]
-    expect(page.locator(".send [aria-live]")).to_contain_text("3 people wait to be sent.")
+    expect(page.locator(".send [aria-live]")).to_contain_text("Pictures of 3 patients wait to be sent.")
     expect(page.locator(".send [aria-live]")).to_contain_text("Next try in 1 minute.")
     queue.receiver.gate.clear()
     tap(page, "#try-now")
@@ -78,7 +78,7 @@ def test_upload_alert_buttons(open_page: Open, queue: Queue) -> None:
 def test_other_screens_mention_automatic_upload(open_page: Open, unchanged_queue: Queue) -> None:
     queue = unchanged_queue
     page = open_page(f"{queue.url}/#/visit/{queue.visits[0]}/outcome")
-    expect(page.locator("#by-itself")).to_have_text("The pictures are sent by themselves.")
+    expect(page.locator("#by-itself")).to_have_text("The pictures are sent automatically.")
     page.goto(f"{queue.url}/#/history")
     tap(page, ".history [data-value=waiting]")
     assert len(queue_items(page)) == 3

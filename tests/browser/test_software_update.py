@@ -129,7 +129,7 @@ def test_update_from_usb_drive(device: Device, open_page: Open, complaints: Comp
         page.locator("#look").tap()
         offered = page.locator("li", has_text="Version 3.0")
         expect(offered).to_contain_text(
-            re.compile(r"The last update took \d+ minutes?\. The camera restarts by itself"), timeout=90_000
+            re.compile(r"The last update took \d+ minutes?\. The camera restarts automatically"), timeout=90_000
         )
     (board.stick / "three.raucb").unlink()
 
@@ -207,5 +207,5 @@ def test_every_update_state_and_error_fits(device: Device, open_page: Open, comp
         alert = page.locator(f".alert[data-code='{kind.code}']")
         expect(alert).to_contain_text(kind.default_remedy)
         assert kind is UpdateError or alert.locator("strong").inner_text() not in trouble.message
-    expect(page.locator("#unsent")).to_contain_text("3 people wait to be sent. They stay on this camera")
+    expect(page.locator("#unsent")).to_contain_text("Pictures of 3 patients wait to be sent. They stay on this camera")
     assert layout_faults(page) == []

@@ -74,7 +74,7 @@ def test_every_sentence_exists_in_every_language(language: str) -> None:
 def test_consent_question_is_spoken_in_patient_language(voices_page: Page, real: Real) -> None:
     voices_page.locator("#say").tap()
     voices_page.get_by_role("button", name="தமிழ்").tap()
-    expect(voices_page.locator("#say")).to_contain_text("Say: May we take pictures of the eyes?")
+    expect(voices_page.locator("#say")).to_contain_text("Say: May we take pictures of your eyes?")
     expect(voices_page.locator("#say small")).to_have_text(sentences("ta")["say.consent"])
     expect(voices_page.locator("#say small")).to_have_attribute("lang", "ta")
     voices_page.locator("#say").tap()
@@ -84,7 +84,7 @@ def test_consent_question_is_spoken_in_patient_language(voices_page: Page, real:
     ]
     assert voices_page.evaluate(ENDED) == [sentences("en")["say.consent"]], "a new sentence ends the old one"
     expect(voices_page.locator("html")).to_have_attribute("lang", "en")
-    expect(voices_page.locator(".asking")).to_contain_text("These sentences are drafts")
+    expect(voices_page.locator(".asking")).to_contain_text("These sentences are not checked yet")
     voices_page.reload()
     expect(voices_page.locator("#say small")).to_have_text(sentences("ta")["say.consent"])
 
@@ -122,11 +122,11 @@ def test_remote_shutter_works_after_speech_button(voices_page: Page, real: Real)
 @pytest.mark.parametrize("size", ["phone", "tablet"])
 def test_without_voice_sentence_is_shown_large(open_page: Open, real: Real, size: str) -> None:
     page = aiming(open_page, real, SIZES[size])  # a headless Chromium has no voice
-    expect(page.locator("#say")).to_contain_text("Read out: Look straight ahead.")
+    expect(page.locator("#say")).to_contain_text("Read aloud: Look straight ahead.")
     page.locator("#say").tap()
     expect(page.locator("dialog[open] #sentence")).to_have_text("Look straight ahead.")
     expect(page.locator("#sentence")).to_have_css("font-size", "40.5px")
-    expect(page.locator("dialog .warning")).to_have_text("This tablet has no voice for English.")
+    expect(page.locator("dialog .warning")).to_have_text("This tablet cannot speak English.")
     assert look_for_faults(page) + axe_faults(page) == []
     page.locator("dialog[open] .primary").tap()
     expect(page.locator("#sentence")).to_be_hidden()
@@ -140,7 +140,7 @@ def test_failed_or_stalled_voice_shows_large_text(open_page: Open, real: Real, v
     visit = real.begin_visit()
     page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     page.locator("#say").tap()
-    expect(page.locator("dialog[open] .warning")).to_have_text("The voice did not work. Please read it out.")
+    expect(page.locator("dialog[open] .warning")).to_have_text("The voice did not work. Please read aloud.")
     expect(page.locator("#sentence")).to_have_text(sentences("en")["say.consent"])
 
 
@@ -152,7 +152,7 @@ def test_tones_and_vibrations_of_capture_events(open_page: Open, real: Real) -> 
     page.goto(f"{real.url}/#/visit/{visit['id']}/patient")
     tap(page, "#shoot")
     wait_for_preview(page)
-    expect(page.locator(".prompt")).to_contain_text("No eye seen")
+    expect(page.locator(".prompt")).to_contain_text("No eye found")
     expect_tones(page)
     real.rig.world.faults.clear()
     page.wait_for_selector(".prompt[data-tone=ready]")

@@ -123,7 +123,7 @@ def test_remedy_without_voice_is_shown_large(open_page: Open, technician_server:
     log_in(page)
     page.wait_for_timeout(700)
     open_section(page, "health")
-    page.get_by_role("button", name="This tablet has no voice. Show large: Battery").tap()
+    page.get_by_role("button", name="This tablet cannot speak. Show large: Battery").tap()
     remedy = page.get_by_text("Charge the device before the next patient.")
     expect(remedy).to_have_css("font-size", "40.5px")
     assert layout_faults(page, "li[data-ok=false]") == []

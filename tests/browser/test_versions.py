@@ -39,13 +39,13 @@ def test_the_picture_as_taken_is_shown_until_a_version_is_chosen(open_page: Open
     page.goto(f"{real.url}/#/visit/{visit}/picture/R-centre/{first}")
     expect(group).to_have_count(1)
     wait_until_drawn(page, "colour 0 0")
-    taken, version = group.get_by_role("button", name="Picture as taken"), group.get_by_role("button", name="Version 1")
+    taken, version = group.get_by_role("button", name="Original picture"), group.get_by_role("button", name="Version 1")
     expect(taken).to_have_attribute("aria-pressed", "true")
     with page.expect_response("**/picture-1.png") as answer:
         version.tap()
     assert answer.value.ok
     expect(version).to_have_attribute("aria-pressed", "true")
-    expect(page.locator(".prompt")).to_contain_text("The picture as taken stays in use.")
+    expect(page.locator(".prompt")).to_contain_text("The original picture stays in use.")
     assert "Version 1" in (page.locator("#picture").get_attribute("aria-label") or "")
     expect(page.get_by_role("button", name="Colour")).to_have_count(0)  # this version is in one colour
     assert look_for_faults(page) == []

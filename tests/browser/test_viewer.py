@@ -369,7 +369,7 @@ def test_loupe_without_long_press_or_drag(open_page: Open, real: Real) -> None:
     expect(page.locator("#loupe")).to_have_attribute("aria-pressed", "true")
     page.keyboard.press("b")
     expect(page.get_by_text("Brightness +1")).to_be_visible()
-    page.get_by_role("button", name="Show all").tap()
+    page.get_by_role("button", name="Whole picture").tap()
     expect(pic).to_have_attribute("data-loupe", "")
     expect(page.get_by_text("Brightness +1")).to_have_count(0)
 
@@ -449,7 +449,7 @@ def test_a_visit_with_one_picture_without_colour_is_shown_in_green_and_says_why(
     page = aiming(open_page, real, reduced_motion="reduce")
     take_picture(page)
     wait_until_drawn(page, "colour 0 0")
-    expect(page.locator(".prompt")).to_contain_text("Final picture, kept")
+    expect(page.locator(".prompt")).to_contain_text("Final picture, saved")
     expect(page.locator(".prompt")).not_to_contain_text("green")
     first = page.locator("[data-slot=R-centre] img")
     expect(first).to_have_attribute("src", re.compile("/quick.jpg$"))
@@ -457,10 +457,12 @@ def test_a_visit_with_one_picture_without_colour_is_shown_in_green_and_says_why(
     tap(page, "#next")
     wait_for_preview(page)
     take_picture(page)
-    expect(page.locator(".prompt")).to_contain_text(f"Final picture, kept · {why}")
+    expect(page.locator(".prompt")).to_contain_text(f"Final picture, saved · {why}")
     for slot in ("R-centre", "R-nerve"):
         expect(page.locator(f"[data-slot={slot}] img")).to_have_attribute("src", re.compile("/green.jpg$"))
     expect(page.get_by_role("button", name="Colour")).to_have_count(0)
+    expect(page.locator("#grey")).to_be_visible()
+    expect(page.get_by_role("button", name="Red-free")).to_have_count(0)  # it would change nothing
     tap(page, "[data-slot=R-centre]")
     expect(page.locator(".prompt")).to_contain_text(why)
     wait_until_drawn(page, "colour 0 0")
@@ -490,7 +492,7 @@ def test_a_picture_is_in_colour_and_red_free_is_the_one_in_green(open_page: Open
     page.get_by_role("button", name="Details").tap()
     details = page.get_by_role("dialog")
     expect(details).to_contain_text("green, red, blue (predicted, not measured)")
-    expect(details).not_to_contain_text("one colour of light")
+    expect(details).not_to_contain_text("Black-and-white")
     for name, file in (("Picture in colour (PNG)", "colour.png"), ("Picture (PNG)", "picture.png")):
         href = details.get_by_role("link", name=name, exact=True).get_attribute("href") or ""
         assert href.endswith(f"/{file}")
@@ -556,7 +558,46 @@ def test_comparison_is_reloaded_and_refuses_another_visit(open_page: Open, real:
         route.continue_()
     page.unroute(f"**/api/visits/{other}")
     page.reload()
-    expect(page.locator(".compare figcaption").first).to_contain_text("Right eye · Centre")
+    expect(page.locator(".compare figcaption").first).to_contain_text("Right eye · Macula")
     page.goto(f"{real.url}/#/visit/{visit}/compare/{first}/{second}")
     page.wait_for_selector("[data-screen=patient]")
-    expect(page.locator(".state-bar")).to_contain_text("This picture is of another person.")
+    expect(page.locator(".state-bar")).to_contain_text("This picture is of another patient.")
+
+
+def test_a_thumbnail_shows_the_whole_field(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real, reduced_motion="reduce")
+    take_picture(page)
+    for at in ((390, 844), (800, 1280), (1280, 800)):
+        page.set_viewport_size({"width": at[0], "height": at[1]})
+        image = page.locator("[data-slot=R-centre] img")
+        expect(image).to_have_js_property("complete", True)
+        # What is visible of the image, relative to the diameter of its field: whole from edge to edge.
+        visible = image.evaluate(
+            """async (image) => {
+            const { field_px: field, shape: [, cols] } = await (await fetch("/api/status")).json();
+            const { width, height } = image.parentElement.getBoundingClientRect();
+            const drawn = image.getBoundingClientRect(); // with its scale
+            const diameter = (Math.max(drawn.width, drawn.height) * field) / cols;
+            return [width / diameter, height / diameter];
+        }"""
+        )
+        assert min(visible) >= 1, at
+
+
+def test_an_enlarged_picture_has_an_overview(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real, reduced_motion="reduce")
+    take_picture(page)
+    wait_until_drawn(page, "colour 0 0")
+    picture = page.locator("#picture")
+    corner = """(pic) => { // colour at the edge of the overview, in the lower right corner
+        const c = pic.querySelector("canvas");
+        const side = 0.22 * Math.min(c.width, c.height), margin = (12 * c.width) / c.clientWidth;
+        const { data } = c.getContext("2d").getImageData(c.width - margin - side, c.height - margin - side / 2, 1, 1);
+        return [...data].slice(0, 3);
+    }"""
+    assert picture.evaluate(corner) != [255, 255, 255]
+    for _ in range(3):
+        tap(page, "[aria-label='Zoom in']")
+    expect(picture).to_have_attribute("data-zoom", "3.38")
+    wait_until_drawn(page, "colour 0 0")
+    assert picture.evaluate(corner) == [255, 255, 255]

@@ -41,14 +41,14 @@ def test_home_continues_an_unfinished_visit_of_yesterday(open_page: Open, real: 
     real.clock.moved = timedelta(0)
     page = open_page(f"{real.url}/#/")
     expect(page.locator("#continue")).to_contain_text(re.compile(r"\d{4}"))  # with its day
-    expect(page.locator(".home .day")).to_contain_text("0 to finish")  # of today
+    expect(page.locator(".home .day")).to_contain_text("0 not finished")  # of today
     assert look_for_faults(page, "#continue") == []
     tap(page, "#continue")
     page.wait_for_url(re.compile(visit["id"]))
     page.goto(f"{real.url}/#/")
     real.begin_visit(consent="agreed")
     page.reload()
-    expect(page.locator(".home .day")).to_contain_text("1 to finish")
+    expect(page.locator(".home .day")).to_contain_text("1 not finished")
     expect(page.locator("#continue")).not_to_contain_text("·")
 
 
@@ -90,7 +90,7 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
     expect_face(page, "R-centre", "good")
     tap(page, "#next")
 
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     with real.poor_light("saturated"):
         take_picture(page)
     expect(page.locator(".card")).to_contain_text("Too bright. Move back a little. Take again.")
@@ -109,17 +109,18 @@ def test_visit_with_retake_and_not_possible(open_page: Open, real: Real, size: t
         tap(page, "#again")
     take_picture(page)
     real.show(None)
-    expect(page.locator(".card")).to_contain_text("Not clear after 3 tries. That is useful to know.")
+    expect(page.locator(".card")).to_contain_text("Not clear after 3 tries. Choose “Not possible”.")
     tap(page, "#not-possible")
     faults["why"] = look_for_faults(page)
     tap(page, "[data-reason=pupil]")
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Optic disc")
     expect_face(page, "L-centre", "not_possible")
 
     take_picture(page)
     expect(page.locator("#next")).to_contain_text("Finish")
     tap(page, "#next")
-    expect(page.locator(".outcome .verdict")).to_contain_text("Refer: not every picture of the left eye possible.")
+    expect(page.locator(".outcome .verdict")).to_contain_text("Refer")
+    expect(page.locator(".reasons")).to_have_text(re.compile("Left eye · .*: Small pupil"))
     faults["outcome"] = look_for_faults(page, "#done")
     visit = real.visit()
     assert len(visit["slots"]["L-centre"]["captures"]) == 3, "every try is kept"
@@ -166,15 +167,15 @@ def test_urgent_complaint_shows_warning(open_page: Open, real: Real) -> None:
 def test_visit_without_consent_can_only_be_finished(open_page: Open, real: Real) -> None:
     visit = real.begin_visit()
     page = open_page(f"{real.url}/#/visit/{visit['id']}/aim/R-centre")
-    expect(page.locator(".state-bar[data-code='consent.missing']")).to_contain_text("First ask: may we take pictures?")
+    expect(page.locator(".state-bar[data-code='consent.missing']")).to_contain_text("Ask the patient first.")
     after_debounce(page).locator(SHUTTER).tap(force=True)
-    expect(page.locator(SHUTTER)).to_contain_text("First ask")
+    expect(page.locator(SHUTTER)).to_contain_text("Ask the patient first")
     expect(page.locator("eye-live[data-frame]")).to_have_count(0)
     assert look_for_faults(page) == []
     tap(page, "[data-do=ask]")
     page.locator("[data-value=declined]").tap()
     tap(page, "#finish")
-    expect(page.locator(".outcome .verdict")).to_have_text("The patient did not agree to pictures. None were taken.")
+    expect(page.locator(".outcome")).to_have_attribute("data-outcome", "declined")
     assert real.visit()["outcome"]["code"] == "declined"
     assert real.presses == 0
     tap(page, "#done")
@@ -189,10 +190,13 @@ def test_finish_asks_when_a_picture_is_missing(open_page: Open, real: Real) -> N
     assert real.visit()["finished_at"] is None
     assert look_for_faults(page) == []
     page.locator("#take-missing").tap()
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Optic disc")
     tap(page, "#finish")
     page.locator("#finish-without").tap()
     page.wait_for_selector(".outcome .verdict")
+    expect(page.locator("#outcome-title")).to_be_focused()
+    after_debounce(page).keyboard.press("Enter")
+    expect(page.locator("#outcome-title")).to_be_visible()  # a second press of a wireless shutter leaves nothing
     assert real.visit()["finished_at"] is not None
 
 
@@ -212,7 +216,7 @@ def test_a_refused_field_is_shown_with_the_number_that_the_server_sent(
 
     page.route(f"**/api/visits/{visit}", refuse)
     page.locator("[data-value=man]").tap()
-    expect(page.locator(".state-bar")).to_contain_text("Rest it 4 minutes.")
+    expect(page.locator(".state-bar")).to_contain_text("Wait 4 minutes with this eye.")
     expect(page.locator("[data-value=man]")).to_have_attribute("aria-pressed", "false")
 
 
@@ -238,7 +242,7 @@ def test_next_press_is_allowed_after_verdict(open_page: Open, real: Real) -> Non
     page = aiming(open_page, real)
     page.locator(SHUTTER).tap()
     page.wait_for_selector("[data-phase=assessed]")
-    expect(page.locator(".card")).to_contain_text("You can go on.")
+    expect(page.locator(".card")).to_contain_text("Sharp and bright enough.")
     expect(page.locator("progress")).to_be_visible()
     tap(page, "#next")
     expect_face(page, "R-centre", "making")
@@ -258,7 +262,7 @@ def test_poor_picture_is_kept_and_older_one_selected(open_page: Open, real: Real
     tap(page, "#again")
     take_picture(page)
     tap(page, "#keep")
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     first, second = real.visit()["slots"]["R-centre"]["captures"]
     page.goto(f"{real.url}/#/visit/{visit_of(page)}/picture/R-centre/{first}")
     tap(page, "#use")
@@ -297,24 +301,28 @@ def test_confirmed_eye_is_not_asked_again(open_page: Open, make_real: MakeReal) 
 
 def test_finished_visit_is_reopened_and_qr_code_has_no_name(open_page: Open, make_real: MakeReal) -> None:
     programme = load_programme()
-    phone = programme.referral.model_copy(update={"centre_phone": "+91 44 5550 0142"})
-    real = make_real(programme=programme.model_copy(update={"referral": phone}))
-    visit = real.begin_visit(consent="agreed", name="Lakshmi")
+    where = {"en": "Eye clinic, District Hospital", "ta": "கண் மருத்துவமனை"}
+    referral = programme.referral.model_copy(update={"centre_phone": "+91 44 5550 0142", "where": where})
+    letter = programme.letter.model_copy(update={"name": "Village Eye Programme"})
+    real = make_real(programme=programme.model_copy(update={"referral": referral, "letter": letter}))
+    visit = real.begin_visit(consent="agreed", name="Lakshmi", vision_od="6/60", vision_os="6/9")
     for slot in ("R-centre", "R-nerve", "L-centre"):
         real.press(visit["id"], slot)
     page = open_page(f"{real.url}/#/visit/{visit['id']}/aim/L-nerve")
     wait_for_preview(page)
     finish_early(after_debounce(page))
     page.locator("#code").tap()
-    page.wait_for_selector("figure.code svg path")
+    page.wait_for_selector(".outcome > figure.code svg path")
     decoded = qr_text(page)
     assert decoded.split("\n")[0] == visit["number"]
-    assert decoded.split("\n")[2:] == ["send", "+91 44 5550 0142"]
+    assert decoded.split("\n")[2:] == ["refer_vision", "+91 44 5550 0142"]
     assert "Lakshmi" not in decoded
     page.emulate_media(media="print")
     expect(page.locator(".slip")).to_be_visible()
     expect(page.locator("header")).to_be_hidden()
     expect(page.locator(".slip")).not_to_contain_text("Lakshmi")
+    for words in ("Village Eye Programme", "6/60", "6/9", "not taken", "Go by", "Eye clinic", "Centre: +91"):
+        expect(page.locator(".slip")).to_contain_text(words)
     page.emulate_media(media="screen")
     tap(page, "#reopen")
     tap(page, "[data-reason=mistake]")
@@ -428,17 +436,17 @@ def test_visit_is_copied_to_usb_and_saved_as_zip(open_page: Open, real: Real) ->
     page.route("**/export.zip", lambda route: route.fulfill(body=b"PK", headers=name))
     with page.expect_download():
         page.get_by_role("link", name="ZIP").tap()
-    expect(page.get_by_role("note")).to_contain_text("Look in its downloads.")
+    expect(page.get_by_role("note")).to_contain_text("in this tablet’s Downloads")
 
 
 def test_control_is_taken_from_another_screen(open_page: Open, real: Real, complaints: Complaints) -> None:
     complaints.expect(r"409 .*/api/preview")  # the next live picture of the first screen
     first = aiming(open_page, real)
     second = after_debounce(open_page(f"{real.url}/#/visit/{visit_of(first)}/aim/R-centre"))
-    expect(second.locator(SHUTTER)).to_contain_text("Other screen")
+    expect(second.locator(SHUTTER)).to_contain_text("Other tablet")
     second.locator("[data-do=useHere]").tap()
     expect(second.locator(SHUTTER)).to_contain_text("Take picture")
-    expect(first.locator(SHUTTER)).to_contain_text("Other screen")
+    expect(first.locator(SHUTTER)).to_contain_text("Other tablet")
     expect(first.locator("eye-live[data-frame]")).to_have_count(0)
 
 
@@ -465,9 +473,9 @@ def test_visit_by_shortcut_keys(open_page: Open, real: Real) -> None:
     stay(page)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     after_debounce(page).keyboard.press("n")
-    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Optic disc")
     page.keyboard.press("4")
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye · Optic disc")
     page.keyboard.press("ArrowLeft")
     page.wait_for_selector("[data-screen=patient]")
     page.keyboard.press("?")
@@ -497,7 +505,7 @@ def test_finish_while_the_visit_is_loading_ends_nothing(open_page: Open, real: R
     page.route("**/api/visits/*", lambda route: held.append(route))  # never answered
     page.reload()
     after_debounce(page).locator("#finish").tap()
-    expect(page.locator("#finish")).to_have_text("Finish with what we have")
+    expect(page.locator("#finish")).to_have_text("Finish without the missing pictures")
     after_debounce(page)
     assert held, "it is still loading"
     assert real.visit()["finished_at"] is None

@@ -110,7 +110,7 @@ def test_a_dim_eye_is_accepted_and_an_even_screen_of_equal_brightness_is_not(tim
     allowed = ("refraction", "little light")  # both are true of a sixteenth of the pixels
     assert all(any(word in words for word in allowed) for words in warnings)
     dim.faults.add("eye.closed")
-    assert report_of(calibration, exposed_counts(dim)).warnings[0].startswith("No eye was seen")
+    assert report_of(calibration, exposed_counts(dim)).warnings[0].startswith("No eye found")
 
 
 @pytest.mark.parametrize("case", ["noise", "mirrored psf"])
@@ -126,7 +126,7 @@ def test_a_frame_that_does_not_come_through_the_psf_is_reported(
     report = report_of(calibration, counts)
     assert report.quality["structure_sure"] is None  # no figure that uses a PSF that does not match
     (words,) = [words for words in report.warnings if "lit" not in words]
-    assert words.startswith("No eye was seen" if case == "noise" else "The PSF does not match this frame")
+    assert words.startswith("No eye found" if case == "noise" else "The PSF does not match this frame")
 
 
 def test_detail_in_the_stopband_does_not_reach_the_picture(world: World, calibration: Calibration) -> None:

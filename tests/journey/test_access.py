@@ -22,9 +22,9 @@ from device.values import Calibration
 from services.delivery.uploader import HttpsUploader, UploadSettings
 from services.errors import AuthenticationError
 from services.health.clock_request import REQUEST
-from services.http.access import ACCESS, Access
+from services.http.access import OPERATIONS, Access
 from services.http.app import create_app
-from services.http.audit_trail import ACTIONS, UNRECORDED
+from services.http.audit_trail import REPEATED
 from services.http.authentication import OWN_SCREEN, PRESSED_S, Authenticator, Peer
 from services.http.rate_limits import RATES
 from services.http.security import SAFE_METHODS
@@ -95,7 +95,7 @@ def filled(path: str) -> str:
 def test_every_operation_is_in_the_table_and_nothing_else_is() -> None:
     """The document names each endpoint but itself."""
     served = [*operations(http_transcript.openapi()), ("GET", "/api/openapi.json")]
-    assert {operation for operation in ACCESS if " /api/" in operation} == {" ".join(one) for one in served}
+    assert {operation for operation in OPERATIONS if " /api/" in operation} == {" ".join(one) for one in served}
 
 
 def operations(document: dict[str, Any]) -> list[tuple[str, str]]:
@@ -115,7 +115,7 @@ def test_each_operation_admits_its_roles_and_refuses_all_others(rig: Rig) -> Non
     left_out = [("GET", "/api/events"), ("DELETE", "/api/login")]  # a stream; and the end of the login that is tried
     pages = [("GET", path) for path in ("/", "/technician", "/web/{name:path}", "/api/openapi.json")]
     for verb, path in [one for one in operations(rig.app.openapi()) if one not in left_out] + pages:
-        rule = ACCESS[f"{verb} {path}"]
+        rule, _ = OPERATIONS[f"{verb} {path}"]
         others = {"none": None, "guessed": "a" * 43, "expired": expired, "revoked": revoked}
         for name, token in (signed_in | others).items():
             if not admits(rule, name) or name == "administrator" or verb in SAFE_METHODS:
@@ -511,10 +511,15 @@ def test_the_time_of_a_tablet_is_accepted_forward_and_an_administrator_sets_it_b
     assert fields == [("Asha", "set-clock-back", both + earlier), ("Ravi", "set-clock", both + later)]
 
 
-def test_each_operation_is_recorded_or_named_as_unrecorded() -> None:
-    assert ACTIONS.keys().isdisjoint(UNRECORDED)
-    assert ACTIONS.keys() | UNRECORDED == ACCESS.keys()
-    assert {operation.split()[0] for operation in UNRECORDED} == {"GET", "POST"}
+def test_each_change_of_data_is_recorded() -> None:
+    """Without an action: answers of the instrument, the next step of an action, a sign that the user is there."""
+    unrecorded = {operation for operation, (_, action) in OPERATIONS.items() if action is None}
+    assert {operation for operation in unrecorded if not operation.startswith("GET ")} == {
+        "POST /api/login/activity",
+        "POST /api/calibration/ready",
+        "POST /api/calibration/trial-lenses/ready",
+    }
+    assert {action for _, action in OPERATIONS.values()} >= REPEATED
 
 
 def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: Path) -> None:
@@ -561,6 +566,30 @@ def test_actions_enter_the_audit_log_before_their_answer(fresh: Rig, tmp_path: P
     assert ([entry["number"] for entry in shown["entries"]], shown["problem"]) == ([2, 1], None)
     (tmp_path / "audit-log.jsonl").write_bytes(b"")
     assert ask(app, "GET", "/api/audit", token).json()["problem"] is not None
+
+
+def test_a_second_user_of_one_tablet_ends_the_login_of_the_first(fresh: Rig) -> None:
+    """The cookie is replaced, and a copy of the first one is of no use."""
+    for name, roles in (("Asha", ROLES), ("Ravi", ROLES[:1])):
+        fresh.authenticator.users.add(name, PIN, roles)
+    token, used = None, []
+    for name in ("Asha", "Ravi"):
+        answer = ask(fresh.app, "POST", "/api/login", token, json={"name": name, "secret": PIN})
+        used.append(token := answer.cookies["login"])
+    assert [ask(fresh.app, "GET", "/api/visits", one).status_code for one in used] == [401, 200]
+    assert ask(fresh.app, "GET", "/api/users", token).status_code == 403, "the rights of the second user"
+
+
+def test_with_a_damaged_audit_log_the_exam_goes_on_and_the_damage_is_shown(fresh: Rig, tmp_path: Path) -> None:
+    (tmp_path / "audit-log.jsonl").write_bytes(b"no entry\n")
+    (tmp_path / "audit-head.json").write_bytes(b"no head")
+    app = create_app(fresh.arbiter, fresh.authenticator, audit_log=AuditLog(tmp_path, b"k" * 32, fresh.clock)).http
+    assert ask(app, "POST", "/api/visits", client=HERE, json={"key": "0" * 16}).status_code == 201
+    assert ask(app, "POST", "/api/captures", client=HERE, json={"eye": "OD"}).status_code == 201
+    fresh.authenticator.users.add("Asha", PIN, ROLES)
+    shown = ask(app, "GET", "/api/audit", fresh.authenticator.sign_in("Asha", PIN, OWN_SCREEN)).json()
+    assert shown["problem"] is not None
+    assert {entry["action"] for entry in shown["entries"]} >= {"begin-visit", "capture"}, "later entries are kept"
 
 
 def test_without_room_for_the_audit_log_the_exam_goes_on(fresh: Rig, tmp_path: Path) -> None:

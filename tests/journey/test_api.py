@@ -177,7 +177,7 @@ def test_hardware_fault_is_answered_with_its_code(old_rig: Any, fault: str, stat
 def test_full_disk_is_507_and_no_capture_is_listed(make_rig: Any) -> None:
     rig = make_rig(store={"free_bytes": lambda _: 0})
     words = refused(rig.request("POST", "/api/captures", json=OD), 507, "store.full")
-    assert "Nothing that was kept is lost" in words["remedy"]
+    assert "Nothing that was saved is lost" in words["remedy"]
     assert rig.request("GET", "/api/captures").json() == {"captures": []}
 
 

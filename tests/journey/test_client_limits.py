@@ -6,10 +6,12 @@ from contextlib import ExitStack, closing
 from typing import Any
 
 import httpx
+from fastapi import Request
 
+from services.errors import ServerFull
 from services.http.app import create_app
 from services.http.authentication import OWN_SCREEN
-from services.http.client_limits import ClientLimits
+from services.http.client_limits import STREAM_LIMITS, ClientLimits, limit_clients
 from services.http.connection_limits import ConnectionLimits
 from tests.journey.conftest import Rig, until
 from tests.journey.serving import served
@@ -43,6 +45,26 @@ def test_more_event_streams_than_permitted_are_refused_until_one_ends(rig: Rig) 
         first.close()
         until(lambda: open_stream()[1].status == 200)
         rig.event_bus.close()
+
+
+def test_the_streams_of_remote_users_leave_the_own_screen_its_own() -> None:
+    admitted, streams = limit_clients(STREAM_LIMITS), []
+
+    async def is_opened(host: str) -> bool:
+        streams.append(admitted(Request({"type": "http", "client": (host, 50000)})))
+        try:
+            await anext(streams[-1])
+        except ServerFull:
+            return False
+        return True
+
+    async def opened(hosts: list[str]) -> int:
+        return sum([await is_opened(host) for host in hosts])
+
+    async def both() -> tuple[int, int]:
+        return await opened([f"10.42.0.{number}" for number in range(40)]), await opened(["127.0.0.1"] * 40)
+
+    assert asyncio.run(both()) == (16, 16)
 
 
 def test_remote_clients_do_not_take_the_live_picture_from_a_local_one(rig: Rig) -> None:

@@ -130,6 +130,21 @@ def test_the_lamp_goes_dark_when_the_user_is_signed_out_or_idle(make_rig: MakeRi
     assert status("GET", live) == 200
 
 
+def test_a_user_who_is_removed_in_an_exam_gets_no_more_light_and_another_one_continues(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    visit = visit_with_consent(rig)["id"]
+    users = rig.authenticator.users
+    for name, roles in (("Asha", ROLES), ("Ravi", ROLES[:1])):
+        users.add(name, PIN, roles)
+    asha, ravi = ({"Cookie": f"login={rig.authenticator.sign_in(name, PIN, OWN_SCREEN)}"} for name in ("Asha", "Ravi"))
+    picture = {"eye": "OD", "visit": visit, "slot": "R-centre", "key": "1" * 16}
+    users.remove("Ravi")
+    assert rig.request("POST", "/api/captures", json=picture, headers=ravi).status_code == 401
+    assert rig.request("GET", f"/api/preview?after=0&eye=OD&visit={visit}", headers=ravi).status_code == 401
+    assert (rig.world.illumination, doses_j_per_cm2(rig)["OD"]) == (None, 0)
+    assert rig.request("POST", "/api/captures", json=picture, headers=asha).status_code == 201
+
+
 LIT_BY: dict[str, dict[str, Any]] = {
     "/api/captures": {"eye": "OD"},
     "/api/calibration": {"serial": "1", "by": "A", "source_deg": 0.1},

@@ -174,7 +174,8 @@ def test_a_visit_without_possible_pictures_can_be_finished(old_rig: Any) -> None
         assert answer["slots"][slot]["state"] == "not_possible"
         assert answer["slots"][slot]["reason"] == reason
     ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
-    assert ended["outcome"] == {"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}
+    assert (ended["outcome"]["code"], ended["outcome"]["urgency"]) == ("refer_picture", "soon")
+    assert [reason["value"] for reason in ended["outcome"]["reasons"]] == ["pupil", "cloudy", "still", "refused"]
     where = f"/api/visits/{visit['id']}/not-possible"
     refused(
         old_rig.request("POST", where, json={"key": next(keys), "slot": "R-centre", "reason": "pupil"}),
@@ -406,7 +407,7 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
         answer = refused(
             old_rig.request("POST", path, json={"key": next(keys), **body}, headers=other), 409, "link.other"
         )
-        assert answer["remedy"] == "Another screen is taking pictures."
+        assert answer["remedy"] == "Another tablet is using the camera."
         assert old_rig.request("POST", path, json={"key": next(keys), **body}, headers=mine).status_code == 201
     begin(old_rig)  # without the header: a script
     taken = post(old_rig, "/api/controller", key=other["X-Controller"], take=True)

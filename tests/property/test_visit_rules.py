@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from device.errors import InputError
 from services.records.capture import StoredVerdict
+from services.records.json_values import FormValue
 from services.records.numbering import (
     automatic_number,
     check_digit,
@@ -17,7 +18,7 @@ from services.records.numbering import (
     normalise,
 )
 from services.records.programme import VISIONS, load_programme
-from services.records.visit import SlotCapture, SlotDecision, SlotState, decide_outcome, decision_after
+from services.records.visit import Outcome, SlotCapture, SlotDecision, SlotState, decide_outcome, decision_after
 
 PROGRAMME = load_programme()
 LIMIT = VISIONS.index(PROGRAMME.referral.vision_limit)
@@ -107,26 +108,54 @@ fields = st.fixed_dictionaries(
 
 
 @given(fields, visits)
-def test_the_outcome_follows_the_rules_in_order(answers: dict[str, Any], slots: dict[str, SlotState]) -> None:
+def test_the_headline_follows_the_rules_in_order(answers: dict[str, Any], slots: dict[str, SlotState]) -> None:
     result = decide_outcome(PROGRAMME, answers, slots)
-    urgent = {"sudden_loss", "pain"} & set(answers.get("complaints") or [])
+    is_urgent = {"sudden_loss", "pain"} & set(answers.get("complaints") or [])
     is_low = any(VISIONS.index(answers[eye]) > LIMIT for eye in ("vision_od", "vision_os") if answers.get(eye))
     states = {id: slot.state for id, slot in slots.items()}
+    whys = {slot.decision.reason for slot in slots.values() if slot.decision and slot.decision.reason}
     is_missing = any({states[f"{side}-centre"], states[f"{side}-nerve"]} == {"empty"} for side in "RL")
+    is_refused = answers.get("consent") == "declined" or (whys == {"refused"} and "taken" not in states.values())
     expected = (
         "refer_today"
-        if urgent
+        if is_urgent
         else "refer_vision"
         if is_low
         else "declined"
         if answers.get("consent") == "declined"
         else "refer_picture"
-        if is_missing or "not_possible" in states.values()
+        if is_missing or whys - {"refused"}
+        else "declined"
+        if is_refused
         else "send"
     )
     assert result.code == expected
-    assert result.sentence.endswith(".")
-    assert not {"normal", "disease", "healthy", "retinopathy", "glaucoma"} & set(result.sentence.lower().split())
+    assert result.urgency == {"refer_today": "today", "declined": "none", "send": "none"}.get(expected, "soon")
+
+
+@given(fields, visits)
+def test_every_cause_is_a_reason_once(answers: dict[str, Any], slots: dict[str, SlotState]) -> None:
+    reasons = decide_outcome(PROGRAMME, answers, slots).reasons
+    assert len(set(reasons)) == len(reasons)
+    of: dict[str, list[tuple[Any, Any, Any]]] = {}
+    for reason in reasons:
+        of.setdefault(reason.code, []).append((reason.eye, reason.field, reason.value))
+    assert {value for _, _, value in of.get("complaint", [])} == set(answers.get("complaints") or [])
+    eyes = (("OD", answers.get("vision_od")), ("OS", answers.get("vision_os")))
+    low = [(eye, None, value) for eye, value in eyes if value and VISIONS.index(value) > LIMIT]
+    assert of.get("vision", []) == low
+    named = {(slot.eye, slot.field): slots[slot.id] for slot in PROGRAMME.slots}
+    for (eye, field), slot in named.items():
+        found = {reason.code for reason in reasons if reason.eye == eye and reason.field == field}
+        if slot.state == "not_possible":
+            assert found == {"not_possible"}
+        elif slot.chosen:
+            is_poor = slot.chosen.verdict is not None and not slot.chosen.is_good
+            assert found == ({"quality"} if is_poor else set())
+        elif answers.get("consent") == "declined":
+            assert ("declined" in of, found) == (True, set())
+        else:
+            assert found == {"not_taken"} or (eye, None, None) in of["not_taken"]
 
 
 @given(slot_states)
@@ -149,33 +178,51 @@ def test_another_picture_never_makes_a_slot_worse(slot: SlotState, new: SlotCapt
     assert after.captures[:-1] == slot.captures
 
 
+def outcome_of(states: tuple[str, ...], why: str = "pupil", **answers: FormValue) -> Outcome:
+    """Return the outcome of a visit with these states of R-centre, R-nerve, L-centre and L-nerve."""
+    of = {
+        "taken": SlotState((SlotCapture("a", None),)),
+        "empty": SlotState(),
+        "no": SlotState((), SlotDecision(None, why)),
+    }
+    ids = ("R-centre", "R-nerve", "L-centre", "L-nerve")
+    return decide_outcome(PROGRAMME, answers, {id: of[state] for id, state in zip(ids, states, strict=True)})
+
+
+def listed(result: Outcome) -> list[str]:
+    """Return the values of each reason as one text."""
+    named = [(reason.code, reason.eye, reason.field, reason.value) for reason in result.reasons]
+    return [" ".join(filter(None, values)) for values in named]
+
+
 @pytest.mark.parametrize("vision", [VISIONS[LIMIT], VISIONS[LIMIT + 1]])
 def test_vision_at_the_limit_is_not_referred(vision: str) -> None:
-    good = SlotState((SlotCapture("a", None),))
-    result = decide_outcome(PROGRAMME, {"vision_os": vision}, {slot.id: good for slot in PROGRAMME.slots})
-    assert result.code == ("send" if vision == VISIONS[LIMIT] else "refer_vision")
-    if result.code == "refer_vision":
-        assert result.sentence == "Refer: vision of the left eye below 6/18."
+    result = outcome_of(("taken",) * 4, vision_os=vision)
+    is_low = vision != VISIONS[LIMIT]
+    assert (result.code, listed(result)) == (("refer_vision", ["vision OS 6/24"]) if is_low else ("send", []))
+
+
+def test_the_outcome_lists_every_reason_the_most_urgent_first() -> None:
+    result = outcome_of(("taken", "no", "empty", "empty"), vision_od="6/60", complaints=["red", "pain"])
+    assert (result.code, result.urgency) == ("refer_today", "today")
+    assert listed(result) == [
+        "complaint pain",
+        "complaint red",
+        "vision OD 6/60",
+        "not_possible OD nerve pupil",
+        "not_taken OS",
+    ]
 
 
 @pytest.mark.parametrize(
-    ("right", "left", "sentence"),
+    ("states", "code"),
     [
-        (
-            ("taken", "not_possible"),
-            ("empty", "empty"),
-            "Refer: not every picture of the right eye possible; picture of the left eye not taken.",
-        ),
-        (("not_possible", "empty"), ("not_possible", "not_possible"), "Refer: picture of both eyes not possible."),
-        (("taken", "taken"), ("not_possible", "empty"), "Refer: picture of the left eye not possible."),
-        (("taken", "empty"), ("taken", "taken"), "The pictures are kept, 1 not taken. They are for an eye specialist."),
-        (("taken", "taken"), ("taken", "taken"), "The pictures are kept. They are for an eye specialist."),
+        (("no", "no", "no", "no"), "declined"),
+        (("taken", "taken", "no", "no"), "send"),
+        (("no", "no", "empty", "empty"), "refer_picture"),  # of the left eye no picture was tried
     ],
 )
-def test_untaken_and_impossible_pictures_have_different_sentences(
-    right: tuple[str, str], left: tuple[str, str], sentence: str
-) -> None:
-    refused = SlotState((), SlotDecision(None, "pupil"))
-    of = {"taken": SlotState((SlotCapture("a", None),)), "empty": SlotState(), "not_possible": refused}
-    states = dict(zip(("R-centre", "R-nerve", "L-centre", "L-nerve"), (*right, *left), strict=True))
-    assert decide_outcome(PROGRAMME, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence
+def test_pictures_that_the_patient_refused_are_no_referral(states: tuple[str, ...], code: str) -> None:
+    result = outcome_of(states, why="refused")
+    assert result.code == code
+    assert "not_possible OS centre refused" in listed(result) or states[2] == "empty"

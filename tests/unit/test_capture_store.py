@@ -26,6 +26,7 @@ from services.records import schema
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.quarantine import REQUIRED_FILES
+from tests.golden.files import KEPT
 
 MEMORY = Path("/dev/shm")  # order does not depend on the disk, and the test makes many stores
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -369,13 +370,14 @@ TABLES_AND_INDEXES = (
 )
 
 
-def test_the_migrations_create_the_schema_of_the_models(store: CaptureStore) -> None:
-    engine = schema.open_engine(store.folder / "store.sqlite")
+def test_the_migrations_lead_to_the_schema_of_the_models(tmp_path: Path) -> None:
+    engine = schema.open_engine(Path(shutil.copy(KEPT / "data" / schema.DATABASE, tmp_path)))
+    schema.migrate(engine, lambda _: None)
     with engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), schema.Base.metadata) == []
         made = set(connection.exec_driver_sql(TABLES_AND_INDEXES).scalars())
     engine.dispose()
-    fresh = schema.open_engine(store.folder / "models.sqlite")
+    fresh = schema.open_engine(tmp_path / "models.sqlite")
     with schema.for_writing(fresh).begin() as connection:
         schema.Base.metadata.create_all(connection)
         declared = set(connection.exec_driver_sql(TABLES_AND_INDEXES).scalars())

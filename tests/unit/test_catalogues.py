@@ -2,9 +2,13 @@
 
 import json
 import re
+from typing import get_args
 
 import pytest
 
+from services.records.answers import COMPLAINTS
+from services.records.programme import REASONS, VISIONS
+from services.records.visit import OutcomeCode
 from tests.project_files import files, text
 
 DRAFTS = ("hi", "ta", "te")
@@ -63,6 +67,17 @@ def test_a_translation_has_only_master_keys_and_variables(language: str, folder:
     assert missing <= {"aim.live", "stop.other"}
 
 
+@pytest.mark.parametrize("name", ["en", "technician/en", "pairing/en"])
+def test_one_english_word_for_one_thing(name: str) -> None:
+    """Patient, picture, saved, not possible, eye doctor, macula, optic disc: never another word for the same thing."""
+    others = (
+        r"\b(person|people|kept|keeping|specialist|photos?|shot|loupe|quick look|as taken|by itself|by themselves)\b"
+        r"|^(could not|made|being made|agreed|erase|centre|nerve|to finish|dim room|daylight|hold still|complaints)$"
+        r"|\b(being made|needs set-up|setting up|first ask|enough light|another screen|has no voice|read out)\b"
+    )
+    assert {key: words for key, words in catalogue(name).items() if re.search(others, words, re.IGNORECASE)} == {}
+
+
 def test_the_pages_ask_for_texts_that_the_master_has() -> None:
     """Only keys that are written out; those that are made from a code are tried by the tests of the page."""
     shared, technician = set(by_key(ENGLISH)), set(by_key(TECHNICIAN))
@@ -74,3 +89,13 @@ def test_the_pages_ask_for_texts_that_the_master_has() -> None:
             asked += len(keys)
             assert keys <= shared | (technician if "technician/" in name else set()), name
     assert asked > 200
+
+
+@pytest.mark.parametrize("language", ["en", *DRAFTS])
+def test_every_outcome_has_its_texts_in_each_catalogue(language: str) -> None:
+    headlines = {f"outcome.{code}" for code in get_args(OutcomeCode)}
+    names = {f"complaint.{name}" for name in COMPLAINTS} | {f"reason.{name}" for name in REASONS}
+    pictures = {"outcome.not_taken", "outcome.no_picture", "outcome.quality", "field.vision_od", "field.vision_os"}
+    visions = {f"vision.{vision}" for vision in VISIONS if "/" not in vision}
+    directions = {"outcome.today", "outcome.soon", "outcome.where", "outcome.phone"}
+    assert headlines | names | pictures | visions | directions <= set(catalogue(language))

@@ -57,6 +57,7 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
     ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
     ("database", {"recovery": RecoveryReport(missing=["c"])}),
+    ("database", {"recovery": RecoveryReport(lost_visits=["v"])}),
     ("backup", {"unsaved_since": datetime(2026, 11, 14, 11, tzinfo=UTC)}),
     ("audit_log", {"audit_log_bytes": 50_600_000}),
     ("settings", {"settings_problem": ("diffuscope.toml is not TOML", "Correct the file on the card.")}),
@@ -115,7 +116,7 @@ def test_a_large_number_of_visits_is_not_shown() -> None:
         for check in run_checks(replace(HEALTHY, people_left=n))
         if check.name == "space"
     ]
-    assert shown == ["200 people", "plenty, more than 200 people"]
+    assert shown == ["200 patients", "plenty, more than 200 patients"]
 
 
 def test_few_free_files_have_their_own_remedy() -> None:
@@ -131,7 +132,7 @@ def test_few_free_files_have_their_own_remedy() -> None:
 
 def test_quarantined_captures_are_reported_with_the_free_space() -> None:
     space = next(check for check in run_checks(replace(HEALTHY, torn_bytes=[9_500_000, 1])) if check.name == "space")
-    assert (space.ok, space.value) == (True, "100 people; half-kept pictures aside: 2, 10 MB")
+    assert (space.ok, space.value) == (True, "100 patients; half-saved pictures aside: 2, 10 MB")
 
 
 def test_missing_parts_of_a_head_are_no_failure() -> None:

@@ -191,6 +191,23 @@ def test_the_files_of_a_store_alone_rebuild_all_that_it_shows(filled: tuple[Path
         assert store.recovery == RecoveryReport()
 
 
+@pytest.mark.parametrize("is_gone", [True, False], ids=["gone", "damaged"])
+def test_a_visit_that_is_lost_with_the_database_is_reported(
+    filled: tuple[Path, Shown], tmp_path: Path, is_gone: bool
+) -> None:
+    """Two faults at once. The pictures of the visit are listed, and name it."""
+    folder, before = shutil.copytree(filled[0], tmp_path / "copy"), filled[1]
+    (folder / "store.sqlite").unlink()
+    file = sorted((folder / "visits").iterdir())[0]
+    if is_gone:
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:-20])
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        assert store.recovery.lost_visits == [file.stem]
+        assert len(store.captures(100)) == len(before.captures)
+
+
 def test_an_older_database_does_not_undo_later_changes(tmp_path: Path) -> None:
     folder, clock = tmp_path / "store", VirtualClock()
     with CaptureStore(folder, reserve_bytes=0) as store:

@@ -174,10 +174,26 @@ def test_the_wait_survives_a_restart_and_damage_is_a_full_wait(tmp_path: Path, c
         lock_out.record_failure("asha", "10.0.0.7")
     restarted = LockOut(tmp_path, VirtualClock())
     assert restarted.wait_s("asha", "10.0.0.9", False) == 64
-    restarted.record_success("asha", "10.0.0.9")
+    restarted.record_success("asha", "10.0.0.7")
     assert LockOut(tmp_path, VirtualClock()).wait_s("asha", "10.0.0.7", False) == 0
     (tmp_path / "lock-out.json").write_bytes(b"{}")
     assert LockOut(tmp_path, VirtualClock()).wait_s("ravi", "10.0.0.9", False) == MAX_WAIT_S
+
+
+def test_wrong_attempts_of_others_are_no_wait_where_a_user_signed_in_before(
+    tmp_path: Path, clock: VirtualClock
+) -> None:
+    """Also after a restart. Own wrong attempts count there, and those of others count on at all other addresses."""
+    LockOut(tmp_path, clock).record_success("asha", "10.0.0.9")
+    lock_out = LockOut(tmp_path, clock)
+    for number in range(1000):
+        lock_out.record_failure("asha", f"10.0.0.{number % 8}")
+    assert lock_out.wait_s("asha", "10.0.0.9", False) == 0
+    assert lock_out.wait_s("asha", "10.0.0.10", False) == MAX_WAIT_S
+    lock_out.record_success("asha", "10.0.0.9")
+    assert lock_out.wait_s("asha", "10.0.0.10", False) == MAX_WAIT_S, "a sign-in gives others no further guesses"
+    lock_out.record_failure("asha", "10.0.0.9")
+    assert lock_out.wait_s("asha", "10.0.0.9", False) == 1
 
 
 def test_a_thousand_guesses_take_three_days(tmp_path: Path, clock: VirtualClock) -> None:

@@ -36,7 +36,7 @@ export function patientLabel({ number: plain, fields }) {
 
 const TILE_FACES = {
   empty: ["circle", "tile.empty"], // known fields show their drawing instead
-  good: ["star", "tile.good"],
+  good: ["check", "tile.good"],
   poor: ["pen", "tile.poor"],
   not_possible: ["cross", "tile.not_possible"],
   making: ["wait", "tile.making"],

@@ -17,7 +17,6 @@ const PATHS = {
   down: svg`<path d="M12 5v14M6 13l6 6 6-6"></path>`,
   sun: svg`<circle cx="12" cy="12" r="4"></circle><path d="M12 3v2M12 19v2M3 12h2M19 12h2M6 6l1 1M17 17l1 1M18 6l-1 1M6 18l1-1"></path>`,
   pen: svg`<path d="M5 19l1-4L16 5l3 3L9 18z"></path>`,
-  star: svg`<path d="M12 4l2.4 5 5.6.7-4.1 3.8 1 5.5-4.9-2.7L7.1 19l1-5.5L4 9.7 9.6 9z"></path>`,
   warn: svg`<path d="M12 4 2.5 20h19zM12 10v4.5M12 17.2v.3"></path>`,
   wait: svg`<circle cx="12" cy="12" r="9"></circle><path d="M12 7v5l3.5 2"></path>`,
   menu: svg`<path d="M4 7h16M4 12h16M4 17h16"></path>`,

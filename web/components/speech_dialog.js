@@ -26,7 +26,7 @@ export function speechButtons({ speech, route }) {
 export function consentQuestion({ speech }) {
   if (!speech) return nothing;
   return html`<div class="asking">
-    ${button(speech, "say.consent", "say", t("consent"), speech.hasVoice ? translatedText(speech, "say.consent") : noVoice(speech))}
+    ${button(speech, "say.consent", "say", t("voice.consent"), speech.hasVoice ? translatedText(speech, "say.consent") : noVoice(speech))}
     ${languages(speech)}
   </div>`;
 }

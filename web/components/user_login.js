@@ -4,7 +4,7 @@
 
 import { icon } from "./icons.js";
 import { sentences } from "../core/api.js";
-import { knownNames, rememberName, requestLogin } from "../core/login.js";
+import { codeOfLabel, knownNames, rememberName, requestLogin } from "../core/login.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
 
@@ -17,8 +17,6 @@ const REQUESTS = {
   forgotten: ["POST", "/api/setup"],
   own: ["PUT", "/api/login/secret"],
 };
-// Read before the router replaces the fragment.
-const CODE_OF_LABEL = new URLSearchParams(location.hash.slice(1)).get("code") ?? "";
 // These are over the page of a user who is signed in.
 const HAS_CANCEL = ["access.confirm", "own"];
 
@@ -115,7 +113,7 @@ function view({ code, name, error, busy }, actions) {
   return html`<dialog class="login" aria-labelledby="login-title" @cancel=${actions.cancel}>
     <form @submit=${actions.submit} autocomplete="off">
       <h2 id="login-title">${icon("person")} ${t(TITLES[code] ?? (isOwn || isForgotten ? `login.${code}` : "login.title"))}</h2>
-      ${isSetup ? html`<p>${t("login.setup.why")} ${isForgotten ? t("login.forgotten.how") : ""}</p>${field("code", t("login.code"), "text", CODE_OF_LABEL)}` : nothing}
+      ${isSetup ? html`<p>${t("login.setup.why")} ${isForgotten ? t("login.forgotten.how") : ""}</p>${field("code", t("login.code"), "text", codeOfLabel)}` : nothing}
       ${hasCancel ? nothing : names(name, isSetup ? [] : knownNames(), actions)}
       ${field("secret", t(isSetup ? "login.new" : isOwn ? "login.old" : "login.pin"), "password")}
       ${isOwn ? field("new", t("login.new"), "password") : nothing}

@@ -5,7 +5,6 @@ import { clamp, homeBox } from "./viewport.js";
 import { get, otherEyeSlot, saveSetting, set, currentCapture } from "./state.js";
 import { applyKey, isNumber } from "./numbers.js";
 import { playCue, resetPictureTools, takePicture } from "./capture.js";
-import { qrCode } from "./qr_code.js";
 import { navigate } from "./router.js";
 import { dismissAlert, lowerAlert, lowerAlerts, raiseAlert } from "./alerts.js";
 import { previewActions } from "./aiming.js";
@@ -99,10 +98,7 @@ const examActions = {
   moveToOtherEye: (slot, capture) => visits.moveToOtherEye(slot, capture),
   print: () => window.print(),
 
-  async toggleQrCode() {
-    const drawn = await qrCode(visits.qrText(get()));
-    set({ qrCode: get().qrCode ? null : drawn });
-  },
+  toggleQrCode: () => set({ isCodeShown: !get().isCodeShown }),
 
   openPictures: (visit) => {
     set({ visit });
@@ -168,7 +164,7 @@ const pictureActions = {
   thumbLoaded({ target }) {
     const { naturalWidth: width, naturalHeight: height } = target;
     const home = homeBox(get().status, width, height);
-    target.style.transform = `scale(${Math.min(width, height) / Math.min(home.width, home.height)})`;
+    target.style.transform = `scale(${Math.max(width, height) / Math.max(home.width, home.height)})`;
   },
 };
 

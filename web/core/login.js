@@ -5,6 +5,9 @@ const ACTIVITY_MS = 30_000; // at most one activity report in this time
 const NAMES = "diffuscope.names";
 const MAX_NAMES = 6;
 
+/** Set-up code in the address that the label shows; read before the router replaces the fragment. */
+export const codeOfLabel = new URLSearchParams(location.hash.slice(1)).get("code") ?? "";
+
 /**
  * Ask the user for a login if an answer of the server requires one; return whether it does.
  * @param {{code: string}} answer

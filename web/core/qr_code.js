@@ -1,8 +1,16 @@
-// QR code of a text; the encoder is loaded with the first code.
+// QR code of a text, of which the last one is kept.
 
-/** @returns {Promise<{size: number, path: string}>} the dark modules as one SVG path, one unit per module. */
-export async function qrCode(text) {
-  const { correction, generate } = await import("../vendor/lean-qr-nano.mjs");
+import { correction, generate } from "../vendor/lean-qr-nano.mjs";
+
+let last = { text: "", size: 0, path: "" };
+
+/** Return the number of modules of a side, and the dark modules as one SVG path, one unit per module. */
+export function qrCode(text) {
+  if (last.text !== text) last = { text, ...drawn(text) };
+  return last;
+}
+
+function drawn(text) {
   const bitmap = generate(text, { minCorrectionLevel: correction.M });
   const { size } = bitmap;
   const rows = Array.from({ length: size }, (_, y) =>

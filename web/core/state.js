@@ -52,8 +52,10 @@ const settings = Object.freeze({
  * What the page reads of the server's answers (`services/http/schemas/`), and its own captures and alerts.
  * @typedef {{word: string, code?: string | null}} Verdict
  * @typedef {{state: string, capture: string | null, captures: string[], verdict: Verdict | null, reason: string | null, tries: number}} Slot
+ * @typedef {{code: string, eye: string | null, field: string | null, value: string | null}} Reason
+ * @typedef {{code: string, urgency: string, reasons: Reason[]}} Outcome
  * @typedef {{id: string, number: string, begun_at: string, fields: Record<string, any>, slots: Record<string, Slot>,
- *   next_slot: string | null, no_colour: string | null, outcome: {code: string, sentence: string} | null,
+ *   next_slot: string | null, no_colour: string | null, outcome: Outcome | null,
  *   finished_at: string | null, day: string, undo_until: string | null, waiting?: string[]}} Visit
  * @typedef {{id: string, visit: string | null, slot: string | null, eye: string, taken_at: string, verdict: Verdict | null,
  *   simulated: boolean, report: any, links: Record<string, string>, versions?: any[], calibration_id: string, test: boolean}} CaptureRecord
@@ -62,7 +64,7 @@ const settings = Object.freeze({
  *   record?: CaptureRecord, failed?: {code: string, message: string, remedy: string}, answerLost?: boolean, reloaded?: boolean}} Capture
  * @typedef {{code: string, level: string, rank: number, buttons: string[], from: string, until: number, [more: string]: any}} Alert
  * @typedef {{id: string, eye: string, field: string, required: boolean}} SlotPlan
- * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, referral: Record<string, any>, numbers: Record<string, any>}} Programme
+ * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, referral: Record<string, any>, letter: {name: string | null}, numbers: Record<string, any>}} Programme
  * @typedef {{link: string, status: any, user: {name: string, roles: string[], is_demo: boolean} | null, activity: string, hasControl: boolean, alerts: readonly Alert[],
  *   route: import("./router.js").Route, programme: Programme | null, visit: Visit | null, visits: Visit[] | null,
  *   counts: {done: number, to_finish: number, referred: number, declined: number} | null, typed: string, listFilter: string,
@@ -72,7 +74,7 @@ const settings = Object.freeze({
  *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, uploadQueue: any,
  *   finishing: string | null, goesOnFrom: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
  *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
- *   blink: boolean, front: number, qrCode: {size: number, path: string} | null, noticeCount: number,
+ *   blink: boolean, front: number, isCodeShown: boolean, noticeCount: number,
  *   shownFindings: readonly string[], interruptedShown: boolean, promptedMs: number, readySinceMs: number}} State
  */
 
@@ -113,7 +115,7 @@ export const store = createStore(/** @type {State} */ ({
   timer: 0, // end of the rest of a small pupil, in milliseconds
   blink: false, // the compared pictures lie one over the other
   front: 0, // which of them is in front
-  qrCode: null, // of the outcome, while it is shown
+  isCodeShown: false, // of the outcome
   ...SHOWN,
 }));
 

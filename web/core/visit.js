@@ -282,7 +282,7 @@ export async function copyTo({ id: folder, name }) {
 }
 
 /** Return the content of the QR code: number, date, outcome, telephone of the centre. Never a picture, name or age. */
-export function qrText({ visit, programme }) {
-  const day = (visit.finished_at ?? visit.begun_at).slice(0, 10);
-  return [visit.number, day, visit.outcome.code, programme?.referral?.centre_phone].filter(Boolean).join("\n");
+export function qrText({ number, finished_at: end, begun_at: begin, outcome }, programme) {
+  const day = (end ?? begin).slice(0, 10);
+  return [number, day, outcome.code, programme?.referral?.centre_phone].filter(Boolean).join("\n");
 }

@@ -1,5 +1,5 @@
 // Picture screen: progress and result in place; the verdict comes before the final picture and selects the primary
-// button. Three verdict texts: Good, Take again, Could not.
+// button. Three verdict texts: Good, Take again, Not possible.
 
 import { icon } from "../components/icons.js";
 import { colourLink } from "../core/api.js";
@@ -79,7 +79,7 @@ function verdictText(state, capture) {
   if (capture.failed) return ["warn", t("verdict.again"), alertText(capture.failed)];
   if (capture.verdict?.word === "good") {
     const what = t(followingSlot(state) ? "verdict.good.next" : "verdict.good.what");
-    return ["star", t("verdict.good"), [what, capture.over ? "" : t("make.goon")].join(" ")];
+    return ["check", t("verdict.good"), [what, capture.over ? "" : t("make.goon")].join(" ")];
   }
   if (!capture.verdict) return ["check", t("verdict.none"), ""];
   if (exhausted(state, capture)) return ["pen", t("verdict.again"), alertText({ code: "shot.poor", n: triesOf(state, capture) })];
@@ -114,7 +114,8 @@ const progressBar = ({ stage }) => html`<progress max="1" .value=${stage.fractio
 // ---- tools
 
 /** @param {State} state */
-function tools({ redfree, version, visit, brightness, contrast, loupe, zoom }, actions, capture) {
+function tools({ redfree, version, visit, brightness, contrast, loupe, zoom, grey }, actions, capture) {
+  const coloured = Boolean(capture && colourLink(capture, version, visit));
   const step = (tool, label, by) => html`
     <div class="step" data-repeat role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
@@ -126,13 +127,15 @@ function tools({ redfree, version, visit, brightness, contrast, loupe, zoom }, a
   const zoomBy = (way) => (way > 0 ? actions.zoomIn() : actions.zoomOut());
   return html`
     <div class="tools" role="group" aria-label=${t("part.tools")}>
-      <div class="pair">
-        ${[false, true].map(
-          (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => actions.setRedfree(on)}>
-            ${t(on ? "tool.redfree" : capture && colourLink(capture, version, visit) ? "tool.colour" : "tool.plain")}
-          </button>`,
-        )}
-      </div>
+      ${grey && !coloured
+        ? html`<p class="pair muted" id="grey">${t("tool.grey")}</p>`
+        : html`<div class="pair">
+            ${[false, true].map(
+              (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => actions.setRedfree(on)}>
+                ${t(on ? "tool.redfree" : coloured ? "tool.colour" : "tool.plain")}
+              </button>`,
+            )}
+          </div>`}
       ${versions(version, actions, capture)} ${step("tool.brightness", signed("tool.brightness", brightness), actions.brightnessBy)}
       <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => actions.setLoupe(!loupe)}>${t("tool.loupe")}</button>
       ${step("tool.contrast", signed("tool.contrast", contrast), actions.contrastBy)}

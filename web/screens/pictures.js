@@ -19,7 +19,7 @@ export function pictures(state, actions) {
   return html`
     <section class="pictures">
       <h2>${t("pictures.title", { number: displayNumber(visit.number) })}</h2>
-      ${visit.outcome ? html`<p>${outcomeTexts(visit.outcome, state.language).filter(Boolean).join(" · ")}</p>` : nothing}
+      ${visit.outcome ? html`<p>${outcomeTexts(visit.outcome).join(" · ")}</p>` : nothing}
       ${whyGreen(visit) ? html`<p class="muted" id="green">${whyGreen(visit)}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((capture) => captureItem(state, actions, capture))}</ul>` : html`<p>${t("pictures.none")}</p>`}
       ${Object.entries(state.montages).map(([eye, made]) => montage(visit, actions, eye, made))}

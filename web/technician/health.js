@@ -65,8 +65,8 @@ class InstrumentHealth extends HTMLElement {
   #reportActions = {
     copy: () => this.#showMessage(t(copyText(this.querySelector("textarea")) ? "report.copied" : "report.notcopied")),
     save: () => save(this.#text()),
-    code: async () => {
-      this.#code = this.#code ? null : await qrCode(this.#text());
+    code: () => {
+      this.#code = this.#code ? null : qrCode(this.#text());
       this.#draw();
     },
   };

@@ -235,12 +235,12 @@ def quality_warnings(
 def _words_for_operators(quality: dict[str, float | None]) -> dict[str, str]:
     return {
         "saturated": f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.",
-        "diffuse": "No eye was seen: the light came from everywhere. Centre the ring on the pupil.",
+        "diffuse": "No eye found: the light came from everywhere. Point the camera at the pupil.",
         "unexplained": f"{UNEXPLAINED} Take it again in steady light.",
         "partly lit": (
             f"Only {quality.get('coverage') or 0:.0%} {PARTLY_LIT}. Ask to look at the green light; take it again."
         ),
-        "too dark": "Too little light came back for vessels. Centre the ring on the pupil; take it again.",
+        "too dark": "Too little light came back for vessels. Point the camera at the pupil; take it again.",
     }
 
 

@@ -8,7 +8,6 @@ from device.errors import CalibrationMissing
 from device.recon.stage import Recipe
 from device.values import Calibration
 from services.http.media import PngResponse, SvgResponse, file_responses
-from services.http.problem_responses import error_text
 from services.http.schemas.accuracy import AccuracyAnswer, TimeBudgetChoice
 from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
 from services.records.capture_store import CaptureStore
@@ -75,17 +74,7 @@ def _accuracy_router(explorer: AccuracyExplorer) -> APIRouter:
 
 def accuracy_answer(explorer: AccuracyExplorer) -> AccuracyAnswer:
     """Return the state of the accuracy explorer."""
-    now = explorer.state()
-    return AccuracyAnswer(
-        measured=now.measured,
-        shipped=now.shipped,
-        pace=now.pace,
-        paces_s=dict(now.paces_s),
-        busy=now.busy,
-        progress=now.progress,
-        scene=now.scene,
-        problem=error_text(now.problem),
-    )
+    return AccuracyAnswer.model_validate(explorer.state())
 
 
 def _stored_frames(store: CaptureStore, id: str, seen: Calibration) -> StoredCapture:

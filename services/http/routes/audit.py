@@ -3,7 +3,7 @@
 from fastapi import APIRouter, Query
 
 from services.errors import RecordNotFound
-from services.http.schemas.audit import AuditAnswer, AuditEntryAnswer
+from services.http.schemas.audit import AuditAnswer
 from services.records.audit_log import NEWEST_BYTES, AuditLog
 
 
@@ -26,7 +26,6 @@ def audit_router(audit_log: AuditLog | None) -> APIRouter:
         if audit_log is None:
             raise RecordNotFound("no audit log is kept", "Look at the event log for the reason.")
         found, newest = audit_log.check(NEWEST_BYTES), audit_log.entries(limit, user, action, record)
-        shown = [AuditEntryAnswer.model_validate(entry) for entry in newest]
-        return AuditAnswer(entries=shown, count=found.entries, problem=found.problem)
+        return AuditAnswer(entries=newest, count=found.entries, problem=found.problem)
 
     return router

@@ -7,7 +7,7 @@ from services.delivery.usb_drives import UsbDrives, copy_to_drive
 from services.health.event_log import EventLog
 from services.http.media import TextResponse, file_responses
 from services.http.schemas.common import FolderName
-from services.http.schemas.event_log import EventLogExport, LogEntryAnswer, LogEntryList
+from services.http.schemas.event_log import EventLogExport, LogEntryList
 
 
 def event_log_routes(event_log: EventLog, drives: UsbDrives, clock: Clock) -> APIRouter:
@@ -23,7 +23,7 @@ def event_log_routes(event_log: EventLog, drives: UsbDrives, clock: Clock) -> AP
 
         At most `limit` entries; `about` restricts them to one capture id.
         """
-        return LogEntryList(entries=[LogEntryAnswer.model_validate(entry) for entry in event_log.entries(limit, about)])
+        return LogEntryList(entries=event_log.entries(limit, about))
 
     @router.get("/event-log.txt", response_class=TextResponse, responses=file_responses("text/plain"))
     def download() -> TextResponse:

@@ -1,5 +1,7 @@
 """Endpoints of the montage of one eye of a visit."""
 
+from dataclasses import asdict
+
 from fastapi import APIRouter
 
 from device.values import Eye
@@ -53,17 +55,7 @@ def montage_answer(montage: VisitMontage) -> MontageAnswer:
         problem=error_text(montage.problem),
         projection=None if montage.made is None else montage.made.projection,
         placed=[
-            PlacedPicture(
-                index=at.index,
-                slot=taken.slot,
-                capture=taken.capture,
-                used=at.used,
-                shift_px=at.shift_px,
-                rotation_deg=at.rotation_deg,
-                peak=at.peak,
-                overlap=at.overlap,
-                reason=at.reason,
-            )
+            PlacedPicture(slot=taken.slot, capture=taken.capture, **asdict(at))
             for taken, at in zip(montage.pictures, placed, strict=False)
         ],
     )

@@ -19,10 +19,8 @@ from services.http.schemas.status import (
     CheckAnswer,
     FindingAnswer,
     HealthAnswer,
-    InterruptedCaptureAnswer,
     PictureTimesAnswer,
     StatusAnswer,
-    UploadCountsAnswer,
 )
 from services.instrument.head_arbiter import HeadArbiter
 from services.instrument.status import interrupted_captures, read_status, wait_until_dark
@@ -102,15 +100,13 @@ def status_answer(
         shape=head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
         field_px=2 * radius_px if radius_px < float("inf") else None,
         version=VERSION,
-        swept=[
-            InterruptedCaptureAnswer.model_validate(capture) for capture in interrupted_captures(arbiter, repository)
-        ],
+        swept=interrupted_captures(arbiter, repository),
         space_left=store.space.captures_left(),
         people_left=store.space.visits_left(len(repository.programme.slots)),
         controller=lease.holder,
         problem=problem_body(problem) if problem else None,
         standing=[AlertAnswer.model_validate(alert) for alert in alerts.active_alerts()],
-        sending=UploadCountsAnswer.model_validate(upload_worker.counts()) if upload_worker is not None else None,
+        sending=upload_worker.counts() if upload_worker is not None else None,
         last_capture_at=next((capture.taken_at for capture in store.captures(1)), None),
         notices=[finding.remedy for finding in arbiter.findings if not finding.ok and not is_age_warning(finding)],
     )

@@ -7,8 +7,8 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from device.errors import InputError
-from services.http.schemas.updates import UpdateAnswer, UpdateChoice
-from services.instrument.update_requests import UpdateRequests
+from services.http.schemas.updates import UpdateChoice
+from services.instrument.update_requests import UpdateRequests, UpdateStatus
 from services.update.ipc import UpdateRequest
 
 UPLOAD_PATH = "/api/update/file"
@@ -19,9 +19,9 @@ def update_routes(desk: UpdateRequests) -> APIRouter:
     router = APIRouter(prefix="/api/update")
 
     @router.get("")
-    def update_status() -> UpdateAnswer:
+    def update_status() -> UpdateStatus:
         """Return the running version, the progress of an update, the updates found, and the last error."""
-        return UpdateAnswer.model_validate(desk.status())
+        return desk.status()
 
     router.include_router(_request_router(desk))
     router.include_router(_upload_router(desk))
@@ -32,12 +32,12 @@ def _request_router(desk: UpdateRequests) -> APIRouter:
     """Return the router of the requests to the updater: search, install, restart."""
     router = APIRouter()
 
-    def requested(request: UpdateRequest) -> UpdateAnswer:
+    def requested(request: UpdateRequest) -> UpdateStatus:
         desk.request(request)
-        return UpdateAnswer.model_validate(desk.status())
+        return desk.status()
 
     @router.post("/check", status_code=202)
-    def check() -> UpdateAnswer:
+    def check() -> UpdateStatus:
         """Request a search for updates on USB drives, in the uploaded file and in the channel.
 
         Answers 202 with the status; the updater runs as another process. 409 (`update.busy`) while an update is under
@@ -46,7 +46,7 @@ def _request_router(desk: UpdateRequests) -> APIRouter:
         return requested(UpdateRequest(do="check"))
 
     @router.post("/install", status_code=202)
-    def install(choice: UpdateChoice) -> UpdateAnswer:
+    def install(choice: UpdateChoice) -> UpdateStatus:
         """Request the install of one of the updates found; the device restarts by itself afterwards.
 
         Answers 202 with the status; 409 (`update.busy`) while an update is under way.
@@ -54,7 +54,7 @@ def _request_router(desk: UpdateRequests) -> APIRouter:
         return requested(UpdateRequest(do="install", id=choice.id))
 
     @router.post("/restart", status_code=202)
-    def restart() -> UpdateAnswer:
+    def restart() -> UpdateStatus:
         """Request a restart into the installed version to try it.
 
         Answers 202 with the status; 409 (`update.busy`) while an update is under way.
@@ -69,7 +69,7 @@ def _upload_router(desk: UpdateRequests) -> APIRouter:
     router = APIRouter()
 
     @router.put("/file", status_code=201)
-    async def receive(request: Request, content_length: Annotated[int, Header(ge=0)]) -> UpdateAnswer:
+    async def receive(request: Request, content_length: Annotated[int, Header(ge=0)]) -> UpdateStatus:
         """Store an update file (the request body) for the updater; a later search finds it.
 
         Answers 201 with the status; 409 while an update is under way, 422 if the connection ends early, 507 if the file
@@ -82,6 +82,6 @@ def _upload_router(desk: UpdateRequests) -> APIRouter:
                 await run_in_threadpool(upload.publish)
         except ClientDisconnect as error:  # the client is gone; the event log records the error
             raise InputError("the tablet went away before all had arrived", "Send the file again.") from error
-        return UpdateAnswer.model_validate(desk.status())
+        return desk.status()
 
     return router

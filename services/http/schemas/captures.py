@@ -10,12 +10,11 @@ from services.http.schemas.common import (
     ID_PATTERN,
     KEY_PATTERN,
     IdempotentRequest,
-    OmittedIfNone,
     RequestBody,
     ResponseBody,
 )
 from services.records.capture import COLOUR, Capture, CaptureVersion, ShownReport, StoredVerdict
-from services.records.json_values import Timestamp
+from services.records.json_values import OmittedIfNone, Timestamp
 
 
 class NewCapture(RequestBody):

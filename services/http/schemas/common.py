@@ -1,7 +1,7 @@
 """Bases and shared types of all request and response bodies."""
 
 import re
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
@@ -10,10 +10,6 @@ ID_PATTERN = "^[A-Za-z0-9._-]{1,128}$"
 Key = Annotated[str, Field(pattern=KEY_PATTERN)]
 RecordId = Annotated[str, Field(pattern=ID_PATTERN)]
 SlotName = Annotated[str, Field(min_length=1, max_length=40)]
-Value = TypeVar("Value")
-OmittedIfNone = Annotated[
-    Value | None, Field(exclude_if=lambda value: value is None)
-]  # the key is absent without a value
 
 
 # Absolute paths, in quotation marks or without spaces, down to their last part; no URL, and no endpoint.

@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from services.health.event_log import LogEntry
 from services.http.schemas.common import RequestBody, ResponseBody
 
 
@@ -11,18 +12,7 @@ class EventLogExport(RequestBody):
     folder: str = Field(max_length=400)
 
 
-class LogEntryAnswer(ResponseBody):
-    """One entry: time (ISO 8601, UTC), level (lower case), text, code of an error, capture or visit id, traceback."""
-
-    at: str
-    level: str
-    text: str
-    code: str | None
-    about: str | None
-    detail: str | None
-
-
 class LogEntryList(ResponseBody):
     """Entries of the event log, the newest first."""
 
-    entries: list[LogEntryAnswer]
+    entries: list[LogEntry]

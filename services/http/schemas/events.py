@@ -1,16 +1,20 @@
 """Payloads of the server-sent events, by event name."""
 
-from typing import Annotated, Literal
+from functools import reduce
+from itertools import starmap
+from operator import or_
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, create_model
 from pydantic.dataclasses import dataclass
 
 from device.recon.assessment.aiming import AimCode
 from device.values import Verdict
 from services.http.schemas.captures import CaptureAnswer
-from services.http.schemas.common import OmittedIfNone, ResponseBody
+from services.http.schemas.common import ResponseBody
 from services.http.schemas.problems import ErrorText
 from services.http.schemas.status import AlertAnswer, FindingAnswer
+from services.records.json_values import OmittedIfNone
 from services.records.stored_record import CONFIG
 
 
@@ -91,95 +95,26 @@ class ButtonPress(ResponseBody):
     """Press of the button on the handle: the page that aims takes a picture."""
 
 
-class HeartbeatEvent(ResponseBody):
-    """Event `beat`."""
-
-    event: Literal["beat"]
-    data: Heartbeat
-
-
-class StateEvent(ResponseBody):
-    """Event `state`."""
-
-    event: Literal["state"]
-    data: InstrumentState
-
-
-class AimEvent(ResponseBody):
-    """Event `aim`."""
-
-    event: Literal["aim"]
-    data: AimingHint
+PAYLOADS = {
+    "beat": Heartbeat,
+    "state": InstrumentState,
+    "aim": AimingHint,
+    "button": ButtonPress,
+    "stage": CaptureProgress,
+    "verdict": CaptureVerdict,
+    "kept": CaptureAnswer,
+    "failed": Failure,
+    "accuracy": AccuracyProgress,
+    "notice": AlertChange | LeaseChange,
+    "calibration": CalibrationFindings,
+}
 
 
-class ButtonEvent(ResponseBody):
-    """Event `button`."""
-
-    event: Literal["button"]
-    data: ButtonPress
-
-
-class StageEvent(ResponseBody):
-    """Event `stage`."""
-
-    event: Literal["stage"]
-    data: CaptureProgress
+def _event(name: str, payload: Any) -> type[ResponseBody]:
+    """Return the model of an event, such as StateEvent: its name as `event`, its payload as `data`."""
+    fields: dict[str, Any] = {"event": Literal[name], "data": payload}
+    return create_model(f"{name.capitalize()}Event", __base__=ResponseBody, __doc__=f"Event `{name}`.", **fields)
 
 
-class VerdictEvent(ResponseBody):
-    """Event `verdict`."""
-
-    event: Literal["verdict"]
-    data: CaptureVerdict
-
-
-class KeptEvent(ResponseBody):
-    """Event `kept`: a stored capture."""
-
-    event: Literal["kept"]
-    data: CaptureAnswer
-
-
-class FailedEvent(ResponseBody):
-    """Event `failed`."""
-
-    event: Literal["failed"]
-    data: Failure
-
-
-class AccuracyEvent(ResponseBody):
-    """Event `accuracy`."""
-
-    event: Literal["accuracy"]
-    data: AccuracyProgress
-
-
-class NoticeEvent(ResponseBody):
-    """Event `notice`."""
-
-    event: Literal["notice"]
-    data: AlertChange | LeaseChange
-
-
-class CalibrationEvent(ResponseBody):
-    """Event `calibration`."""
-
-    event: Literal["calibration"]
-    data: CalibrationFindings
-
-
-ServerSentEvent = Annotated[
-    HeartbeatEvent
-    | StateEvent
-    | AimEvent
-    | ButtonEvent
-    | StageEvent
-    | VerdictEvent
-    | KeptEvent
-    | FailedEvent
-    | AccuracyEvent
-    | NoticeEvent
-    | CalibrationEvent,
-    Field(discriminator="event"),
-]
-SERVER_SENT_EVENT: TypeAdapter[ServerSentEvent] = TypeAdapter(ServerSentEvent)
+ServerSentEvent: Any = Annotated[reduce(or_, starmap(_event, PAYLOADS.items())), Field(discriminator="event")]
+SERVER_SENT_EVENT: TypeAdapter[Any] = TypeAdapter(ServerSentEvent)

@@ -1,6 +1,7 @@
 """Problem responses: the JSON body of every 4xx and 5xx answer, and errors inside other bodies."""
 
-from services.http.schemas.common import OmittedIfNone, PublicText, ResponseBody
+from services.http.schemas.common import PublicText, ResponseBody
+from services.records.json_values import OmittedIfNone
 
 
 class ErrorText(ResponseBody):

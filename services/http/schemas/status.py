@@ -5,10 +5,12 @@ from typing import Annotated
 from pydantic import PlainSerializer
 
 from device.values import Eye
+from services.delivery.upload_worker import UploadCounts
 from services.health.alerts import AlertCode
-from services.http.schemas.common import OmittedIfNone, PublicText, ResponseBody
+from services.http.schemas.common import PublicText, ResponseBody
 from services.http.schemas.problems import ProblemResponse
-from services.records.json_values import Timestamp
+from services.records.capture_journal import InterruptedCapture
+from services.records.json_values import OmittedIfNone, Timestamp
 
 SignificantDigits = Annotated[float, PlainSerializer(lambda number: float(f"{number:.4g}"), return_type=float)]
 
@@ -29,23 +31,6 @@ class AlertAnswer(ResponseBody):
     other: OmittedIfNone[Eye] = None
 
 
-class InterruptedCaptureAnswer(ResponseBody):
-    """A capture that was interrupted, and the slot for which it has to be repeated; `tries`: earlier captures of it."""
-
-    id: str
-    eye: Eye | None
-    visit: str | None
-    slot: str | None
-    tries: int
-
-
-class UploadCountsAnswer(ResponseBody):
-    """Numbers of visits: today's that were uploaded (`sent`), and all in the queue (`waiting`)."""
-
-    sent: int
-    waiting: int
-
-
 class StatusAnswer(ResponseBody):
     """Status of the instrument: head, state, free space in captures (`space_left`) and visits (`people_left`), alerts.
 
@@ -62,13 +47,13 @@ class StatusAnswer(ResponseBody):
     shape: tuple[int, int]
     field_px: float | None
     version: str
-    swept: list[InterruptedCaptureAnswer]
+    swept: list[InterruptedCapture]
     space_left: int
     people_left: int
     controller: str | None
     problem: ProblemResponse | None
     standing: list[AlertAnswer]
-    sending: UploadCountsAnswer | None
+    sending: UploadCounts | None
     notices: list[str]
     last_capture_at: Timestamp | None
 

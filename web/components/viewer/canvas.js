@@ -31,18 +31,50 @@ export function drawLoupe(context, shown, { u, v, width, height, loupe }) {
   context.save();
   context.beginPath();
   context.arc(centre.x, centre.y, radius, 0, 2 * Math.PI);
-  context.save();
   context.clip();
   context.fillStyle = "#000";
   context.fill();
   drawPicture(context, shown, { u: loupe.u, v: loupe.v, width: width * LOUPE_ZOOM, height: height * LOUPE_ZOOM }, centre);
   context.restore();
+  frame(context, unit, () => context.arc(centre.x, centre.y, radius, 0, 2 * Math.PI));
+}
+
+const OVERVIEW_SHARE = 0.22; // side of the overview relative to the shorter side of the canvas
+const OVERVIEW_MARGIN_CSS_PX = 12;
+
+/**
+ * Draw the whole picture small in the lower right corner, with a frame around the part that fills the canvas.
+ * `width`, `height`, `side`: size on the canvas, in pixels, of the picture and of its part that is visible at zoom 1.
+ */
+export function drawOverview(context, shown, { u, v, width, height, side }) {
+  const { width: wide, height: high } = context.canvas;
+  const unit = wide / context.canvas.clientWidth;
+  const small = Math.min(wide, high) * OVERVIEW_SHARE;
+  const scale = small / side;
+  const [left, top] = [wide, high].map((size) => size - small - OVERVIEW_MARGIN_CSS_PX * unit);
+  context.save();
+  context.beginPath();
+  context.rect(left, top, small, small);
+  context.clip();
+  context.fillStyle = "#000";
+  context.fill();
+  const middle = { x: left + small / 2, y: top + small / 2 };
+  drawPicture(context, shown, { u: 0, v: 0, width: width * scale, height: height * scale }, middle);
+  const corner = { x: middle.x + (u * width - wide / 2) * scale, y: middle.y + (v * width - high / 2) * scale };
+  frame(context, unit, () => context.rect(corner.x, corner.y, wide * scale, high * scale));
+  context.restore();
+  frame(context, unit, () => context.rect(left, top, small, small));
+}
+
+// White on black is visible on every picture.
+function frame(context, unit, outline) {
   for (const [colour, line] of /** @type {[string, number][]} */ ([["#000", 5], ["#fff", 2]])) {
-    context.strokeStyle = colour; // white on black is visible on every picture
+    context.strokeStyle = colour;
     context.lineWidth = line * unit;
+    context.beginPath();
+    outline();
     context.stroke();
   }
-  context.restore();
 }
 
 // Above the finger; without space there, on the side with more space.

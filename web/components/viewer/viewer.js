@@ -4,13 +4,14 @@
 import { getPicture } from "../../core/api.js";
 import { clamp, context2d, fitCanvas, homeBox } from "../../core/viewport.js";
 import { Gestures } from "./gestures.js";
-import { drawLoupe, drawPicture } from "./canvas.js";
+import { drawLoupe, drawOverview, drawPicture } from "./canvas.js";
 import { pictureRenderer } from "./renderer.js";
 import { NEUTRAL } from "./lookup_table.js";
 import { t } from "../../i18n/translate.js";
 
 const ZOOM_MAX = 8;
 const DOUBLE_TAP_ZOOM = 3;
+const OVERVIEW_MIN_ZOOM = 2; // from here on, a small whole picture shows which part is seen
 const STEP = 1.5;
 const FADE_MS = 200;
 const RETRY_MIN_MS = 1000; // a picture that failed to load is requested again, each time after twice the wait
@@ -242,6 +243,11 @@ export class PictureViewer extends HTMLElement {
     const shown = pictureRenderer().render(bitmap, this.#tools);
     drawPicture(context, shown, { u, v, width: width * scale, height: height * scale });
     if (loupe) drawLoupe(context, shown, { u, v, width: width * scale, height: height * scale, loupe });
+    if (zoom >= OVERVIEW_MIN_ZOOM) {
+      const home = homeBox(this.#head, width, height);
+      const side = Math.max(home.width, home.height) * scale;
+      drawOverview(context, shown, { u, v, width: width * scale, height: height * scale, side });
+    }
   }
 
   /** Canvas pixels per pixel of a picture at zoom 1. */
