@@ -397,6 +397,7 @@ def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
         "/api/setup",
         "/api/users",
         "/api/audit",
+        "/api/ssh-keys",
         "/api/clock",
     )  # test_access.py
     assert {path: verbs for path, verbs in served.items() if not path.startswith(own)} == fixed

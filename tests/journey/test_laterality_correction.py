@@ -156,7 +156,14 @@ def test_the_export_follows_the_move(rig: Any) -> None:
     answer = rig.request("GET", f"/api/visits/{visit}/export.zip")
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         files = {name.split("/")[1]: archive.read(name) for name in archive.namelist()}
-    assert set(files) == {"L-nerve-1.png", "L-nerve-1-colour.png", "L-nerve-1.json", "visit.json", "SHA256SUMS"}
+    assert set(files) == {
+        "L-nerve-1.png",
+        "L-nerve-1-colour.png",
+        "L-nerve-1.json",
+        "visit.json",
+        "history.json",
+        "SHA256SUMS",
+    }
     report = json.loads(files["L-nerve-1.json"])
     assert (report["eye"], report["slot"], report["moved"][0]["from_eye"]) == ("OS", "L-nerve", "OD")
     for name, of in (("L-nerve-1.png", "picture.png"), ("L-nerve-1-colour.png", "colour.png")):
