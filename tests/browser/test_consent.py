@@ -141,5 +141,6 @@ def test_visit_is_copied_to_usb_drive(open_page: Open, real: Real) -> None:
         "R-centre-1-colour.png",
         "R-centre-1.json",
         "visit.json",
+        "history.json",
         "SHA256SUMS",
     }

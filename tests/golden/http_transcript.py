@@ -278,6 +278,7 @@ def access() -> list[dict[str, Any]]:
             "GET /api/visits",
             "GET /api/users",
             "GET /api/audit",
+            "GET /api/ssh-keys",
             "POST /api/login/activity",
             "GET /api/preview",
         ):

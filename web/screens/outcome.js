@@ -29,15 +29,15 @@ export function outcome(state, actions) {
       ${state.status?.sending || visit.outcome.code !== "send" ? nothing : html`<p>${t("outcome.copy")}</p>`}
       ${state.status?.sending && visit.outcome.code !== "declined" ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, actions)}
       <div class="ends">
+        <button class="primary big" type="button" id="done" @click=${() => actions.go({ screen: "home" })}>
+          ${t("outcome.done")}
+        </button>
         <button type="button" id="print" @click=${actions.print}>${t("outcome.print")}</button>
         <button type="button" id="code" aria-expanded=${state.isCodeShown} @click=${actions.toggleQrCode}>
           ${t("outcome.code")}
         </button>
         <button type="button" id="pictures" @click=${() => actions.go({ screen: "pictures", visit: visit.id })}>${t("outcome.pictures")}</button>
         ${reopenButton(visit, actions)}
-        <button class="primary big" type="button" id="done" @click=${() => actions.go({ screen: "home" })}>
-          ${t("outcome.done")}
-        </button>
       </div>
       ${state.isCodeShown ? qrFigure(visit, state) : nothing} ${slip(visit, [headline, ...reasons], state)}
     </section>
