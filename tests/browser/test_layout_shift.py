@@ -80,7 +80,7 @@ def test_result_shows_slot_label_and_one_go_on_text(open_page: Open, real: Real)
     page = aiming(open_page, real, SIZES["phone"])
     take_picture(page)
     expect(page.locator(".prompt")).to_contain_text("Right eye · Macula")
-    assert page.locator("main").inner_text().count("You can go on") == 1
+    assert page.locator("main").inner_text().count("Sharp and bright enough") == 1
     expect(page.get_by_role("button", name="Colour")).to_have_attribute("aria-pressed", "true")
 
 
