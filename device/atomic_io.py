@@ -78,13 +78,14 @@ def _make_one(folder: Path, mode: int | None, exist_ok: bool = False) -> None:
     folder.mkdir(0o777 if mode is None else mode, exist_ok=exist_ok)
     if mode is not None:
         folder.chmod(mode)
-    _give_to_owner(folder, folder.parent)
+    if (owner := _other_owner(folder.parent)) is not None:
+        os.lchown(folder, owner, -1)  # of a link that has replaced the folder meanwhile, the link
 
 
-def _give_to_owner(new: Path | int, folder: Path) -> None:
-    """Give a new folder or file (path or descriptor) of root to the owner of `folder`."""
-    if os.geteuid() == 0 and (owner := folder.stat().st_uid) != 0:
-        os.chown(new, owner, -1)
+def _other_owner(folder: Path) -> int | None:
+    """Return the id of the user to whom a new file or folder of root in `folder` belongs; None if nothing changes."""
+    owner = folder.stat().st_uid
+    return owner if os.geteuid() == 0 and owner != 0 else None
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes], private: bool = True) -> None:
@@ -100,8 +101,14 @@ def write_folder(folder: Path, files: Mapping[str, bytes], private: bool = True)
 
 def private_opener(path: str | os.PathLike[str], flags: int) -> int:
     """Return a descriptor of a file, private if it is new; the argument `opener` of `open`."""
-    descriptor = os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
-    _give_to_owner(descriptor, Path(path).parent)
+    owner = _other_owner(Path(path).parent)
+    if owner is None or not flags & os.O_CREAT:
+        return os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+    try:
+        descriptor = os.open(path, flags | os.O_EXCL | os.O_CLOEXEC, PRIVATE_FILE)
+    except FileExistsError:  # keeps its owner: a link that the other user made may lead to a file of root
+        return os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+    os.fchown(descriptor, owner, -1)
     return descriptor
 
 
@@ -112,7 +119,8 @@ def write_file(path: Path, content: bytes, mode: int | None = PRIVATE_FILE) -> N
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else mode)
     with open(descriptor, "wb") as file:
-        _give_to_owner(descriptor, path.parent)
+        if (owner := _other_owner(path.parent)) is not None:
+            os.fchown(descriptor, owner, -1)
         if mode is not None:
             os.fchmod(descriptor, mode)
         file.write(content)

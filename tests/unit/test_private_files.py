@@ -137,3 +137,18 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 def test_what_a_user_names_follows_the_umask(umask: int, tmp_path: Path, writer: str, written: str) -> None:
     WRITERS[writer](tmp_path)
     assert stat.S_IMODE((tmp_path / written).stat().st_mode) == 0o666 & ~umask
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for another user")
+def test_a_file_that_root_opens_through_a_link_keeps_its_owner(tmp_path: Path) -> None:
+    """Otherwise the user of the data folder could get any file of root by a link in it."""
+    of_root, data = tmp_path / "shadow", tmp_path / "data"
+    of_root.write_text("secret\n")
+    data.mkdir()
+    os.chown(data, OTHER_USER_ID, OTHER_USER_ID)
+    (data / "log").symlink_to(of_root)
+    with open(data / "log", "ab", opener=atomic_io.private_opener):
+        pass
+    with open(data / "new", "ab", opener=atomic_io.private_opener):
+        pass
+    assert (of_root.stat().st_uid, (data / "new").stat().st_uid) == (0, OTHER_USER_ID)
