@@ -14,7 +14,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from itertools import product
@@ -33,6 +33,7 @@ from tests.browser.conftest import copy_small_plans, free_port
 from tests.hard.anonymous_client import FORMS, Asked, Report, Target
 from tests.network_namespace import HERE, IN_SPACE, missing, namespace
 from tests.project_files import ROOT
+from tests.signed_in_server import signed_in_server
 from tests.simulated import small_head_toml
 from tests.store_damage import PIN, filled_store
 
@@ -101,31 +102,12 @@ def device(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
 
 @contextmanager
 def running(folder: Path, authority: str) -> Iterator[Device]:
-    """Start the server with its three sockets, sign in at its own screen, and stop it without an error."""
+    """Run the server with its three sockets."""
     ports = free_port(), free_port(), free_port()
     words = ["127.0.0.1", HERE, HERE, *map(str, ports), "--head", str(folder / "head.toml")]
-    with ExitStack() as undo:
-        log = undo.enter_context((folder / "log").open("wb"))
-        command = [sys.executable, "-c", SERVER, *words, "--data", str(folder / "data")]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
-        undo.callback(process.kill)
-        own = undo.enter_context(closing(httpx.Client(base_url=f"http://127.0.0.1:{ports[0]}", timeout=30)))
-        end_s = time.monotonic() + 120
-        while not aims(own):
-            assert process.poll() is None, (folder / "log").read_text()
-            assert time.monotonic() < end_s
-            time.sleep(0.1)
-        assert own.post("/api/login", json={"name": "Asha", "secret": PIN}).status_code == 200
+    command = [sys.executable, "-c", SERVER, *words, "--data", str(folder / "data")]
+    with signed_in_server(command, folder / "log", ports[0]) as own:
         yield Device(folder, ports, own, authority)
-        process.terminate()
-        assert process.wait(30) == 0, (folder / "log").read_text()
-
-
-def aims(client: httpx.Client) -> bool:
-    try:
-        return bool(client.get("/api/status").json()["state"] == "aim")
-    except httpx.HTTPError:
-        return False
 
 
 def plausible(document: dict[str, Any], records: dict[str, str]) -> list[Asked]:
@@ -140,7 +122,7 @@ def plausible(document: dict[str, Any], records: dict[str, str]) -> list[Asked]:
             asked = "&".join(f"{name}={values[name]}" for name in query if name in values)
             content = operation.get("requestBody", {}).get("content", {}).get("application/json")
             body = None if content is None else body_of(document, content["schema"]["$ref"], records)
-            at = re.sub(r"\{(\w+)\}", lambda match: named[match[1]], path)  # noqa: B023  # called at once
+            at = path.format_map(named)
             found.append(Asked(method=verb.upper(), path=f"{at}?{asked}" if asked else at, body=body))
     return sorted(found, key=lambda one: one.method == "DELETE")  # the end of the login and the user come last
 
@@ -148,12 +130,29 @@ def plausible(document: dict[str, Any], records: dict[str, str]) -> list[Asked]:
 def body_of(document: dict[str, Any], reference: str, records: dict[str, str]) -> dict[str, Any]:
     """Return a body with a value for each required field, and for those of a visit."""
     values = {
-        "visit": records["visit"], "capture": records["capture"], "number": records["number"], "slot": "R-centre",
-        "field": "vision_od", "value": "6/60", "name": "Asha", "secret": "111222", "new": "918274", "code": "WRONG",
-        "roles": ["administrator"], "reason": "mistake",
-        "now": "2059-01-01T00:00:00Z", "by": "Eve", "stand": "dark", "folder": "/media/x",
-        "passphrase": "a blue boat in May", "id": "0" * 16, "lens": 0, "take": True,
-    }  # fmt: skip
+        "visit": records["visit"],
+        "capture": records["capture"],
+        "number": records["number"],
+        "slot": "R-centre",
+        "field": "vision_od",
+        "value": "6/60",
+        "name": "Asha",
+        "secret": "111222",
+        "new": "918274",
+        "code": "WRONG",
+        "roles": ["administrator"],
+        "reason": "mistake",
+        "fingerprint": "SHA256:other",
+        "confirmed": True,
+        "now": "2059-01-01T00:00:00Z",
+        "by": "Eve",
+        "stand": "dark",
+        "folder": "/media/x",
+        "passphrase": "a blue boat in May",
+        "id": "0" * 16,
+        "lens": 0,
+        "take": True,
+    }
     schema = document["components"]["schemas"][reference.rpartition("/")[2]]
     wanted = {*schema.get("required", []), *({"visit", "slot", "take", "roles"} & set(schema["properties"]))}
     fixed = {name: kind["enum"][0] for name, kind in schema["properties"].items() if "enum" in kind}
@@ -210,8 +209,9 @@ def test_a_client_without_a_login_on_another_host_reads_changes_lights_and_block
     )
     before = device.digest()
     words = [*IN_SPACE, sys.executable, "-m", "tests.hard.anonymous_client"]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(words, cwd=ROOT, text=True, **pipes) as anonymous:  # type: ignore[call-overload]
+    with subprocess.Popen(words, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as anonymous:
+        assert anonymous.stdin is not None
+        assert anonymous.stdout is not None
         anonymous.stdin.write(target.model_dump_json() + "\n")
         anonymous.stdin.flush()
         assert anonymous.stdout.readline() == "blocking\n"

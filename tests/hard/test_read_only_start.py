@@ -1,12 +1,9 @@
 """The program on a disk that takes no changes: it shows, exports and backs up everything, and gives no light."""
 
 import shutil
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +14,9 @@ import pytest
 from device.values import EYES
 from tests.browser.conftest import copy_small_plans, free_port
 from tests.hard.test_capture_store_full import own_disk
-from tests.project_files import ROOT
+from tests.signed_in_server import signed_in_server
 from tests.simulated import small_head_toml
-from tests.store_damage import PIN, filled_store
+from tests.store_damage import filled_store
 
 DISK = 'mount -o remount,size=300m "$1" && cp -a "$2" "$1/data" && '
 CASES = {  # what happens on the disk before the start; the first start wrote a reserve file
@@ -56,31 +53,12 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
 
 @contextmanager
 def running(folder: Path, data: Path, prefix: tuple[str, ...]) -> Iterator[httpx.Client]:
-    """Start the program, wait until it can aim, yield a client, and stop it; it must end without an error."""
+    """Run the program on a data folder; `prefix`: words before its command."""
     port = free_port()
-    command = [*prefix, str(Path(sys.executable).parent / "diffuscope"), "run", "--head", str(folder / "head.toml")]
-    with ExitStack() as undo:
-        log = undo.enter_context((folder / "log").open("wb"))
-        words = [*command, "--data", str(data), "--port", str(port)]
-        process = subprocess.Popen(words, cwd=ROOT, stdout=log, stderr=log)
-        undo.callback(process.kill)
-        client = undo.enter_context(closing(httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30)))
-        end_s = time.monotonic() + 300
-        while not aims(client):
-            assert process.poll() is None, (folder / "log").read_text()
-            assert time.monotonic() < end_s
-            time.sleep(0.1)
-        assert client.post("/api/login", json={"name": "Asha", "secret": PIN}).status_code == 200
+    program = str(Path(sys.executable).parent / "diffuscope")
+    words = [program, "run", "--head", str(folder / "head.toml"), "--data", str(data), "--port", str(port)]
+    with signed_in_server([*prefix, *words], folder / "log", port) as client:
         yield client
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0, (folder / "log").read_text()
-
-
-def aims(client: httpx.Client) -> bool:
-    try:
-        return bool(client.get("/api/status").json()["state"] == "aim")
-    except httpx.HTTPError:
-        return False
 
 
 def press(client: httpx.Client) -> Any:
