@@ -112,6 +112,7 @@ PAYLOADS = {
 
 def _event(name: str, payload: Any) -> type[ResponseBody]:
     """Return the model of an event, such as StateEvent: its name as `event`, its payload as `data`."""
+    # A dictionary, since mypy takes no Literal of a variable as an argument.
     fields: dict[str, Any] = {"event": Literal[name], "data": payload}
     return create_model(f"{name.capitalize()}Event", __base__=ResponseBody, __doc__=f"Event `{name}`.", **fields)
 
