@@ -48,11 +48,11 @@ def test_the_eye_is_held_still_until_the_last_frame_also_with_a_quick_look(open_
     real.hold = "look"
     tap(page, f"{SHUTTER}[aria-disabled=false]")
     page.wait_for_selector("[data-mark=quick]")
-    expect(page.locator(".prompt")).to_contain_text("Hold still")
-    expect(page.locator(SHUTTER)).to_contain_text("Hold still")
+    expect(page.locator(".prompt")).to_contain_text("Hold the camera still")
+    expect(page.locator(SHUTTER)).to_contain_text("Taking the picture")
     real.hold = None
     wait_for_verdict(page)
-    expect(page.locator(".prompt")).not_to_contain_text("Hold still")
+    expect(page.locator(".prompt")).not_to_contain_text("Hold the camera still")
 
 
 def test_fast_tapping_keeps_every_picture(open_page: Open, real: Real) -> None:
@@ -65,7 +65,7 @@ def test_fast_tapping_keeps_every_picture(open_page: Open, real: Real) -> None:
             stay(page)
             wait_for_verdict(page)
             expect(page.locator("#result-title")).to_have_text("Good")
-            expect(page.locator(".prompt")).not_to_contain_text("Hold still")
+            expect(page.locator(".prompt")).not_to_contain_text("Hold the camera still")
             expect(page.locator(".state")).not_to_have_text("Taking")
             if slot != SLOTS[-1]:
                 tap(page, "#next")
@@ -89,14 +89,14 @@ def test_lost_picture_is_reported_until_retaken(
     wait_for_preview(page)
     real.hold = None
     chip = page.locator("[data-code='shot.lost']")
-    expect(chip.get_by_role("alert")).to_have_text("Right eye, Centre: no picture was kept. Please take it again.")
+    expect(chip.get_by_role("alert")).to_have_text("Right eye, Macula: no picture was saved. Please take it again.")
     real.free_space.is_failing = False
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "lost")
     assert look_for_faults(page, SHUTTER) == []
     take_picture(page)  # the next press keeps the chip
     expect(chip).to_be_visible()
     page.locator("[data-do=takeNow]").tap()
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Centre")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Macula")
     take_picture(page)
     expect(chip).to_have_count(0)
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "good")
@@ -113,7 +113,7 @@ def test_light_cut_returns_to_the_same_slot(open_page: Open, make_real: MakeReal
     until(lambda: real.rig.world.illumination is None)  # the guard has ended the light
     real.clock.gate.set()
     expect(page.locator(".state-bar")).to_contain_text("The light went out too early. Please take it again.")
-    expect(page.locator("[data-screen=aim] #shutter")).to_contain_text("Right eye · Centre")
+    expect(page.locator("[data-screen=aim] #shutter")).to_contain_text("Right eye · Macula")
     expect(page.locator("#next")).to_have_count(0)
     take_picture(page)
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "good")
@@ -140,7 +140,7 @@ def test_finish_waits_for_pending_capture(open_page: Open, real: Real) -> None:
     tap(page, SHUTTER)
     wait_for_verdict(page)
     finish_early(page)
-    expect(page.locator("#finishing h2")).to_have_text("One picture is still being made")
+    expect(page.locator("#finishing h2")).to_have_text("One picture is still being processed")
     expect(page.locator("#finishing progress")).to_be_visible()
     assert look_for_faults(page) == []
     assert real.visit()["finished_at"] is None
@@ -159,7 +159,7 @@ def test_picture_lost_during_finish_is_requested_again(open_page: Open, real: Re
     page.wait_for_selector("#finishing")
     real.hold = None
     expect(page.locator("[data-code='shot.lost']")).to_be_visible()
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Centre")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Macula")
     assert real.visit()["finished_at"] is None
 
 
@@ -174,12 +174,12 @@ def test_not_possible_is_set_and_undone_while_aiming(open_page: Open, real: Real
     tap(page, "[data-reason=lids]")
     tile = page.locator("[data-slot='R-centre']")
     expect(tile).to_have_attribute("data-face", "not_possible")
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
-    expect(page.locator("[data-code='shot.crossed']")).to_contain_text("Right eye, Centre: could not take it.")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Optic disc")
+    expect(page.locator("[data-code='shot.crossed']")).to_contain_text("Right eye, Macula: not possible.")
     assert look_for_faults(page, SHUTTER) == []
     tap(page, "[data-do=uncross]")
     expect(tile).to_have_attribute("data-face", "empty")
-    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Centre")
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Macula")
     tap(page, "#not-possible")
     tap(page, "[data-reason=other]")
     tap(page, "[data-slot='R-centre']")
@@ -224,7 +224,7 @@ def finished(open_page: Open, real: Real, size: tuple[int, int] = (1280, 800)) -
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
 def test_finished_visit_is_read_only_until_reopened(open_page: Open, real: Real, size: tuple[int, int]) -> None:
     page = finished(open_page, real, size)
-    expect(page.locator("#reopen")).to_have_text("Open again")
+    expect(page.locator("#reopen")).to_have_text("Change this visit")
     expect(page.locator("[data-slot='R-nerve']")).to_be_disabled()
     assert look_for_faults(page, "#done") == []
     tap(page, "[data-slot='R-centre']")
