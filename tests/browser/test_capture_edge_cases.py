@@ -278,7 +278,7 @@ def test_light_limit_offers_other_eye_only_during_exam(open_page: Open, real: Re
     CAUSES["light.limit"](real, "")
     real.wait_for_problem("light.limit")
     page = open_page(real.url)
-    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Rest it \d+ minutes"))
+    expect(page.locator(".state-bar")).to_contain_text(re.compile(r"Wait \d+ minutes"))
     expect(page.locator("[data-do=otherEye]")).to_have_count(0)
 
 
@@ -286,7 +286,7 @@ def test_picture_is_moved_to_other_eye_and_back(open_page: Open, real: Real) -> 
     page = aiming(open_page, real)
     take_picture(page)
     tap(page, "#open-details")
-    expect(page.locator("#other-eye")).to_have_text("Change to the left eye")
+    expect(page.locator("#other-eye")).to_have_text("This is the left eye")
     assert look_for_faults(page) == []
     tap(page, "#other-eye")
     expect(page.locator("[data-slot='L-centre']")).to_have_attribute("data-face", "good")
